@@ -1,0 +1,137 @@
+"""Rotations in 2-D and 3-D.
+
+Conventions, stated once: quaternions are scalar-first ``[w, x, y, z]`` and map body to world; in the
+plane an attitude is a heading in radians, ``[θ]``. Perturbations are on the right, in the body frame:
+``R ⊞ δ = R exp(δ)``. World frame ENU, body frame FLU.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_SMALL = 1e-4  # below this angle squared the Taylor series are exact to rounding in float64
+
+
+def cross_matrix(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3 3"]:
+    """``[v]×``, so that ``[v]× w = v × w``."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+
+
+def quaternion_product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
+    """Hamilton product ``a ⊗ b``: rotate by ``b`` first, then by ``a``."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        -1,
+    )
+
+
+def quaternion_conjugate(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
+    """The inverse rotation of a unit quaternion."""
+    return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def quaternion_exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
+    """Rotation vector (rad) to unit quaternion; differentiable at zero."""
+    squared = (v * v).sum(-1, keepdim=True)
+    small = squared < _SMALL
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    scale = torch.where(
+        small, 0.5 - squared / 48 + squared * squared / 3840, (0.5 * angle).sin() / angle
+    )
+    real = torch.where(small, 1 - squared / 8 + squared * squared / 384, (0.5 * angle).cos())
+    return torch.cat((real, scale * v), -1)
+
+
+def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
+    """Unit quaternion to the rotation vector of angle at most π; differentiable at identity."""
+    q = torch.where(q[..., :1] < 0, -q, q)
+    real, imaginary = q[..., :1], q[..., 1:]
+    squared = (imaginary * imaginary).sum(-1, keepdim=True)
+    small = squared < _SMALL
+    sine = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    scale = torch.where(
+        small,
+        2 / real * (1 - squared / (3 * real * real) + squared**2 / (5 * real**4)),
+        2 * torch.atan2(sine, real) / sine,
+    )
+    return scale * imaginary
+
+
+def quaternion_matrix(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3 3"]:
+    """Rotation matrix of a unit quaternion."""
+    w, x, y, z = q.unbind(-1)
+    return torch.stack(
+        (
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ),
+        -1,
+    ).unflatten(-1, (3, 3))
+
+
+def yaw_quaternion(yaw: Float[Tensor, "*s"]) -> Float[Tensor, "*s 4"]:
+    """Rotation about the world's vertical axis."""
+    zero = torch.zeros_like(yaw)
+    return torch.stack(((0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()), -1)
+
+
+def wrap_angle(angle: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """The same angle in [-π, π)."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def rotation_matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
+    """Body-to-world matrix of an attitude: quaternion (a = 4, d = 3) or heading (a = 1, d = 2)."""
+    if attitude.shape[-1] == 4:
+        return quaternion_matrix(attitude)
+    cosine, sine = attitude.cos(), attitude.sin()
+    return torch.cat((cosine, -sine, sine, cosine), -1).unflatten(-1, (2, 2))
+
+
+def rotate_by(attitude: Float[Tensor, "*s a"], delta: Float[Tensor, "*s t"]) -> Float[Tensor, "*s a"]:
+    """``attitude ⊞ delta``: a right (body-frame) perturbation, t = 3 or 1."""
+    if attitude.shape[-1] == 4:
+        turned = quaternion_product(attitude, quaternion_exp(delta))
+        return turned / turned.norm(dim=-1, keepdim=True)
+    return wrap_angle(attitude + delta)
+
+
+def rotation_between(
+    start: Float[Tensor, "*s a"], end: Float[Tensor, "*s a"]
+) -> Float[Tensor, "*s t"]:
+    """``end ⊟ start``: the body-frame rotation vector that takes ``start`` to ``end``."""
+    if start.shape[-1] == 4:
+        return quaternion_log(quaternion_product(quaternion_conjugate(start), end))
+    return wrap_angle(end - start)
+
+
+def rotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
+    """A body-frame vector in the world frame, in elementwise operations only."""
+    return _apply(rotation_matrix(attitude), v)
+
+
+def unrotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
+    """A world-frame vector in the body frame, in elementwise operations only."""
+    return _apply(rotation_matrix(attitude).mT, v)
+
+
+def _apply(matrix: Float[Tensor, "*s d d"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
+    products = matrix * v.unsqueeze(-2)
+    total = products[..., 0] + products[..., 1]
+    return total + products[..., 2] if v.shape[-1] == 3 else total

@@ -1,0 +1,56 @@
+"""Where the truth's motion comes from: one seam for scripted, random and recorded motion.
+
+A ``Motion`` gives position, velocity and attitude at any window of steps. Its carry holds what one
+world drew at reset (and, for motions that integrate, their state at the last step sampled), as
+tensors with a leading row dimension, so that rows can be reset alone.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+Carry = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """True motion over a window: R worlds, K steps, N UAVs, d dimensions, float64.
+
+    ``position`` in metres and ``velocity`` in m/s in the world frame; ``attitude`` is a unit
+    quaternion wxyz, body to world (d = 3), or a heading in rad (d = 2).
+    """
+
+    position: Float64[Tensor, "R K N d"]
+    velocity: Float64[Tensor, "R K N d"]
+    attitude: Float64[Tensor, "R K N a"]
+
+
+@dataclass(frozen=True)
+class Arena:
+    """What a motion may know of its scenario: the box it flies in (m), team size and step (s)."""
+
+    dim: int
+    n_uavs: int
+    dt: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @property
+    def centre(self) -> tuple[float, ...]:
+        return tuple(0.5 * (a + b) for a, b in zip(self.low, self.high, strict=True))
+
+
+class Motion(ABC):
+    """Base of all motions: frozen dataclasses whose fields are the motion's settings."""
+
+    @abstractmethod
+    def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
+        """What R worlds draw at reset, from their row keys; every tensor has leading size R."""
+
+    @abstractmethod
+    def advance(
+        self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
+    ) -> tuple[Kinematics, Carry]:
+        """Truth at ``steps`` (consecutive along K, going on where the last call ended)."""
