@@ -1,0 +1,1 @@
+"""coloc: cooperative localization of UAV swarms as PettingZoo and TorchRL environments."""

@@ -61,7 +61,7 @@ def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
     scale = torch.where(
         small,
         2 / real * (1 - squared / (3 * real * real) + squared**2 / (5 * real**4)),
-        2 * torch.atan2(sine, real) / sine,
+        4 * torch.atan(sine / (1 + real)) / sine,
     )
     return scale * imaginary
 
@@ -89,6 +89,16 @@ def yaw_quaternion(yaw: Float[Tensor, "*s"]) -> Float[Tensor, "*s 4"]:
     """Rotation about the world's vertical axis."""
     zero = torch.zeros_like(yaw)
     return torch.stack(((0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()), -1)
+
+
+def plane_angle(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """Angle of (x, y) in (-π, π], like ``atan2(y, x)``.
+
+    torch's atan2 rounds differently in vectorized bodies and tails, which would make a number
+    depend on the batch it is computed in; atan does not.
+    """
+    half_turn = torch.where(y < 0, -torch.pi, torch.pi)
+    return torch.atan(y / x) + torch.where(x < 0, half_turn, torch.zeros_like(half_turn))
 
 
 def wrap_angle(angle: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:

@@ -1,0 +1,28 @@
+"""Sensors: what each UAV measures of the truth."""
+
+from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window
+from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
+from coloc_env.sensors.height import Height
+from coloc_env.sensors.imu import GRAVITY, Imu
+from coloc_env.sensors.landmarks import Landmarks
+from coloc_env.sensors.odometry import Odometry
+from coloc_env.sensors.range_noise import RangeNoise
+from coloc_env.sensors.ranging import AnchorRanging, Ranging
+
+__all__ = [
+    "GRAVITY",
+    "AnchorRanging",
+    "Height",
+    "Imu",
+    "LandmarkBearings",
+    "Landmarks",
+    "Layout",
+    "Leaf",
+    "Odometry",
+    "RangeNoise",
+    "Ranging",
+    "Recorded",
+    "Sensor",
+    "UavBearings",
+    "Window",
+]

@@ -8,7 +8,7 @@ tensors with a leading row dimension, so that rows can be reset alone.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 Carry = dict[str, Tensor]
@@ -19,12 +19,14 @@ class Kinematics:
     """True motion over a window: R worlds, K steps, N UAVs, d dimensions, float64.
 
     ``position`` in metres and ``velocity`` in m/s in the world frame; ``attitude`` is a unit
-    quaternion wxyz, body to world (d = 3), or a heading in rad (d = 2).
+    quaternion wxyz, body to world (d = 3), or a heading in rad (d = 2). ``valid`` marks where a
+    recording has truth to score against (None: everywhere).
     """
 
     position: Float64[Tensor, "R K N d"]
     velocity: Float64[Tensor, "R K N d"]
     attitude: Float64[Tensor, "R K N a"]
+    valid: Bool[Tensor, "R K N"] | None = None
 
 
 @dataclass(frozen=True)

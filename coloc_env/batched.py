@@ -1,0 +1,117 @@
+"""The TorchRL face: many worlds at once as an ``EnvBase`` with one group of agents, ``uav``."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coloc_env.observation import (
+    action_bounds,
+    action_width,
+    all_leaves,
+    state_bounds,
+)
+from coloc_env.scenario import Scenario
+from coloc_env.scenarios import make_scenario
+from coloc_env.world import World
+
+
+class CoLocEnv(EnvBase):
+    """``num_envs`` worlds of a scenario as one TorchRL environment of batch size [num_envs].
+
+    Keys: ``("uav", "observation", leaf)`` [B, N, F], ``("uav", "action")`` [B, N, A],
+    ``("uav", "reward")`` [B, N, 1], ``("uav", "mask")`` [B, N] (UAVs that have not failed),
+    ``state`` [B, S] (privileged truth) and root ``done``, ``terminated``, ``truncated`` [B, 1]: an
+    episode ends at its horizon, by truncation; a world in which every UAV failed terminates.
+
+    Row b of the first episode is the world of seed ``seed + b``, of the next one
+    ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "indoor-v0",
+        num_envs: int = 1,
+        device: str | torch.device = "cpu",
+        seed: int = 0,
+        **overrides: Any,
+    ) -> None:
+        if isinstance(scenario, str):
+            scenario = make_scenario(scenario, **overrides)
+        elif overrides:
+            raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.scenario = scenario
+        self.world = World(scenario, num_envs, device)
+        self._set_seed(seed)
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        b, n, device = self.batch_size[0], self.scenario.arena.n_uavs, self.device
+        leaves = {
+            name: Bounded(leaf.low, leaf.high, (b, n, leaf.width), device, torch.float32)
+            if leaf.high < float("inf")
+            else Unbounded((b, n, leaf.width), device, torch.float32)
+            for name, leaf in all_leaves(self.scenario).items()
+        }
+        low, high = (torch.tensor(x, device=device) for x in state_bounds(self.scenario))
+        self.observation_spec = Composite(
+            uav=Composite(
+                observation=Composite(leaves, shape=(b, n)),
+                mask=Binary(n, (b, n), device, torch.bool),
+                shape=(b, n),
+            ),
+            state=Bounded(low.expand(b, -1), high.expand(b, -1), (b, len(low)), device),
+            shape=(b,),
+        )
+        low, high = (torch.tensor(x, device=device) for x in action_bounds(self.scenario))
+        shape = (b, n, action_width(self.scenario))
+        action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
+        self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
+        reward = Unbounded((b, n, 1), device, torch.float32)
+        self.reward_spec = Composite(uav=Composite(reward=reward, shape=(b, n)), shape=(b,))
+        flag = Binary(1, (b, 1), device, torch.bool)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(b,)
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            rows = torch.arange(self.batch_size[0], device=self.device)
+            self._seeds = int(seed) + rows
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        rows = None
+        if tensordict is not None and "_reset" in tensordict.keys():
+            rows = tensordict["_reset"].view(-1)
+        self.world.reset(self._seeds, rows)
+        moved = self._seeds + self.batch_size[0]
+        self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
+        return self._observe()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["uav", "action"]
+        self.world.check(action)
+        step = self.world.step(action)
+        out = self._observe()
+        out["uav"].set("reward", step.reward.unsqueeze(-1))
+        truncated = step.truncated.unsqueeze(-1)
+        terminated = ~self.world.alive.any(-1, keepdim=True)
+        out.set("terminated", terminated)
+        out.set("truncated", truncated)
+        out.set("done", terminated | truncated)
+        return out
+
+    def _observe(self) -> TensorDictBase:
+        b, n = self.batch_size[0], self.scenario.arena.n_uavs
+        observation = self.world.observation().to_tensordict()
+        uav = TensorDict(
+            {"observation": observation, "mask": self.world.alive},
+            batch_size=[b, n],
+            device=self.device,
+        )
+        return TensorDict(
+            {"uav": uav, "state": self.world.state()}, batch_size=[b], device=self.device
+        )

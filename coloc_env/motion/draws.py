@@ -1,0 +1,48 @@
+"""What motions draw: keys per UAV, uniform points, and constants kept on their device."""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from coloc_env import noise
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple, device: torch.device) -> Float64[Tensor, "*s"]:
+    """A nested tuple of numbers as a tensor, made once per device; never write to it."""
+    return torch.tensor(values, dtype=torch.float64, device=device)
+
+
+def uav_keys(keys: Int64[Tensor, "R"], n_uavs: int) -> Int64[Tensor, "R N"]:
+    """A key per world and UAV."""
+    uavs = torch.arange(n_uavs, device=keys.device)
+    return noise.fold(keys.unsqueeze(-1).expand(-1, n_uavs), uavs.expand(len(keys), -1))
+
+
+def fold_each(keys: Int64[Tensor, "R N"], index: Int64[Tensor, "R K ..."]) -> Int64[Tensor, "..."]:
+    """Keys of numbered draws (steps or control points): R K N, or with more dimensions, R K N M."""
+    keys = keys.view(len(keys), 1, -1, *(1,) * (index.ndim - 3))
+    keys, index = torch.broadcast_tensors(keys, index)
+    return noise.fold(keys, index)
+
+
+def uniform(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float64[Tensor, "*s n"]:
+    """``count`` numbers in (0, 1) per key, in float64."""
+    return noise.uniform(keys, stream, count).to(torch.float64)
+
+
+def points(
+    keys: Int64[Tensor, "*s"], stream: str, low: tuple[float, ...], high: tuple[float, ...]
+) -> Float64[Tensor, "*s d"]:
+    """One point per key, uniform in a box (m)."""
+    sides = tuple(b - a for a, b in zip(low, high, strict=True))
+    drawn = uniform(keys, stream, len(low))
+    return constant(low, keys.device) + constant(sides, keys.device) * drawn
+
+
+def phases(keys: Int64[Tensor, "R"], n_uavs: int, parts: int) -> Float64[Tensor, "R N"]:
+    """Fraction i / parts of a cycle for UAV i: how a team is spread along one path."""
+    share = torch.arange(n_uavs, device=keys.device, dtype=torch.float64) / parts
+    return share.repeat(len(keys), 1)

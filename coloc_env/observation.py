@@ -1,0 +1,152 @@
+"""Observations: which leaves a scenario's UAVs see, as one batched container and as spaces."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+from jaxtyping import Float32
+from tensordict import TensorDict
+from torch import Tensor
+
+from coloc_env.scenario import Scenario
+from coloc_env.sensors.base import MASK, Leaf
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What N UAVs of B worlds observe at one step: float32 leaves [B, N, F] by name.
+
+    A plain mapping rather than a tensorclass: new sensors bring new leaves, and building one costs
+    nothing in the step.
+    """
+
+    leaves: Mapping[str, Float32[Tensor, "B N F"]]
+
+    def __getitem__(self, name: str) -> Float32[Tensor, "B N F"]:
+        return self.leaves[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.leaves
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """(B, N)."""
+        return next(iter(self.leaves.values())).shape[:2]
+
+    @property
+    def device(self) -> torch.device:
+        return next(iter(self.leaves.values())).device
+
+    def to_tensordict(self) -> TensorDict:
+        """The same leaves with batch size [B, N]."""
+        return TensorDict(dict(self.leaves), batch_size=self.batch_size, device=self.device)
+
+
+def prior_width(dim: int) -> int:
+    """Mean position, velocity and attitude, then standard deviations (per axis for position)."""
+    return 3 * dim + (4 if dim == 3 else 1) + 2
+
+
+def static_leaves(scenario: Scenario) -> dict[str, Leaf]:
+    """Leaves that stay the same over an episode: the prior and the maps."""
+    leaves = {"prior": Leaf(prior_width(scenario.arena.dim))}
+    for sensor in scenario.sensors:
+        leaves |= sensor.map_leaves(scenario.layout)
+    return leaves
+
+
+def sensed_leaves(scenario: Scenario) -> dict[str, Leaf]:
+    """Leaves sensed anew at each step, messages aside."""
+    slots = scenario.layout.slots
+    leaves: dict[str, Leaf] = {}
+    for sensor in scenario.sensors:
+        added = sensor.leaves(scenario.layout)
+        twice = leaves.keys() & added.keys()
+        if twice:
+            raise ValueError(f"{scenario.name}: two sensors deliver the leaf {sorted(twice)[0]!r}")
+        leaves |= added
+    leaves["links"] = Leaf(slots, *MASK)
+    if not scenario.network.dense(scenario.arena.n_uavs):
+        leaves["neighbours"] = Leaf(slots, 0.0, float(scenario.arena.n_uavs - 1))
+    return leaves
+
+
+def message_leaves(scenario: Scenario) -> dict[str, Leaf]:
+    """What other UAVs' messages bring: per slot the sender's action, and whether one came."""
+    slots = scenario.layout.slots
+    return {
+        "messages": Leaf(slots * action_width(scenario)),
+        "message_mask": Leaf(slots, *MASK),
+    }
+
+
+def action_width(scenario: Scenario) -> int:
+    """Position, velocity and log standard deviation of the position, per axis."""
+    return 3 * scenario.arena.dim
+
+
+def all_leaves(scenario: Scenario) -> dict[str, Leaf]:
+    """Every leaf of an observation, in the order of the spaces."""
+    return sensed_leaves(scenario) | message_leaves(scenario) | static_leaves(scenario)
+
+
+def observation_space(scenario: Scenario) -> gym.spaces.Dict:
+    """One UAV's observation: a Dict of 1-D float32 Boxes."""
+    return gym.spaces.Dict(
+        {
+            name: gym.spaces.Box(leaf.low, leaf.high, (leaf.width,), np.float32)
+            for name, leaf in all_leaves(scenario).items()
+        }
+    )
+
+
+def action_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
+    """Bounds of the flat action: twice the arena's extent, ±50 m/s, log-std within ±10.
+
+    They describe where sensible estimates lie (and what samples look like); a finite estimate
+    beyond them is scored, not refused.
+    """
+    arena = scenario.arena
+    low, high = [], []
+    for a, b in zip(arena.low, arena.high, strict=True):
+        low.append(a - 0.5 * (b - a))
+        high.append(b + 0.5 * (b - a))
+    dim = arena.dim
+    return low + [-50.0] * dim + [-10.0] * dim, high + [50.0] * dim + [10.0] * dim
+
+
+def action_space(scenario: Scenario) -> gym.spaces.Box:
+    """One UAV's action ``[position, velocity, log-std]``."""
+    low, high = action_bounds(scenario)
+    return gym.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+
+
+def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
+    """Bounds of the privileged truth: per UAV position, velocity, attitude, alive, scored."""
+    arena = scenario.arena
+    attitude = [1.0] * 4 if arena.dim == 3 else [float(np.pi) + 1e-6]
+    margin = [0.1 * (b - a) + 1.0 for a, b in zip(arena.low, arena.high, strict=True)]
+    low = [a - m for a, m in zip(arena.low, margin, strict=True)]
+    high = [b + m for b, m in zip(arena.high, margin, strict=True)]
+    low += [-500.0] * arena.dim + [-x for x in attitude] + [0.0, 0.0]
+    high += [500.0] * arena.dim + attitude + [1.0, 1.0]
+    return low * arena.n_uavs, high * arena.n_uavs
+
+
+def state_space(scenario: Scenario) -> gym.spaces.Box:
+    """The privileged truth of the whole team, flat and bounded."""
+    low, high = state_bounds(scenario)
+    return gym.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+
+
+def stack(observations: Iterable[Mapping[str, np.ndarray]]) -> Observation:
+    """Observations of the agents of one PettingZoo world as an ``Observation`` with B = 1."""
+    agents = list(observations)
+    return Observation(
+        {
+            name: torch.from_numpy(np.stack([agent[name] for agent in agents])).unsqueeze(0)
+            for name in agents[0]
+        }
+    )

@@ -1,0 +1,233 @@
+"""The PettingZoo face: one world, numpy in and out."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import parallel_to_aec
+
+from coloc_env.observation import action_space, observation_space, state_space
+from coloc_env.render import Renderer
+from coloc_env.scenario import Scenario
+from coloc_env.scenarios import make_scenario
+from coloc_env.world import World
+
+RENDER_MODES = ("human", "rgb_array")
+
+
+class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
+    """Cooperative localization as a PettingZoo parallel environment.
+
+    Each UAV's observation is a Dict of 1-D float32 Boxes; its action is a flat Box
+    ``[position (m), velocity (m/s), log-std of the position]`` in the world frame, the estimate of
+    the state at the very step observed; its reward −‖p̂ − p‖ by default. The horizon truncates; a
+    failed UAV terminates. Infos are flat and numeric: ``error`` of the step just scored (m),
+    ``scored``, and the episode's ``episode_rmse``, ``episode_mean``, ``episode_max`` so far.
+    """
+
+    metadata = {  # noqa: RUF012 (PettingZoo's own convention)
+        "name": "coloc",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(self, scenario: Scenario, render_mode: str | None = None) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(
+                f"render_mode={render_mode!r} is not allowed: None, {', '.join(RENDER_MODES)}"
+            )
+        self.scenario = scenario
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "name": scenario.name}
+        self.world = World(scenario)
+        self.possible_agents = scenario.agents
+        self.agents: list[str] = []
+        self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
+        space, actions = observation_space(scenario), action_space(scenario)
+        self.observation_spaces = {agent: space for agent in self.possible_agents}
+        self.action_spaces = {agent: actions for agent in self.possible_agents}
+        self.state_space = state_space(scenario)
+        self._width = actions.shape[0]
+        self._next_seed: int | None = None
+        self._rows: list[list[dict[str, np.ndarray]]] = []
+        self._renderer: Renderer | None = None
+
+    def observation_space(self, agent: str) -> gym.spaces.Dict:
+        """The same space object for every agent and call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gym.spaces.Box:
+        """The same space object for every agent and call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, dict[str, float]]]:
+        """Start an episode: the world of ``seed``; without one, of the seed after the last."""
+        if seed is None:
+            fresh = int(np.random.SeedSequence().generate_state(1)[0])
+            seed = fresh if self._next_seed is None else self._next_seed
+        self._next_seed = seed + 1
+        self.agents = list(self.possible_agents)
+        self.world.reset([seed])
+        self._sum = np.zeros((3, len(self.agents)))  # of errors, of their squares; the largest
+        self._count = np.zeros(len(self.agents))
+        self._estimates = torch.zeros(1, len(self.agents), self._width)
+        self._static = [
+            {name: leaf[0, i].numpy().copy() for name, leaf in self.world.static.items()}
+            for i in range(len(self.agents))
+        ]
+        self._sensed = None
+        if self.render_mode is not None:
+            self._renderer = Renderer(self.scenario)
+        zeros = np.zeros(len(self.agents))
+        infos = self._infos(self.agents, zeros, zeros)
+        return self._observe(self.agents), infos
+
+    def step(
+        self, actions: Mapping[str, np.ndarray]
+    ) -> tuple[
+        dict[str, dict[str, np.ndarray]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, float]],
+    ]:
+        """Score the estimates of the step observed last, then move to the next.
+
+        Raises ValueError for a missing or unknown agent, a wrong shape, NaN or infinity.
+        """
+        if not self.agents:
+            raise ValueError(f"{self.scenario.name}: the episode is over; call reset() first")
+        acting, world = self.agents, self.world
+        estimates = self._estimates_of(actions)
+        if self._renderer is not None:
+            self._renderer.record(world, estimates)
+        step = world.step(estimates)
+        error, scored = step.error[0].numpy(), step.scored[0].numpy()
+        self._count += scored
+        self._sum[0] += error
+        self._sum[1] += error * error
+        np.maximum(self._sum[2], error, out=self._sum[2])
+        rewards = step.reward[0].tolist()
+        failed = step.terminated[0].tolist()
+        over = int(world.step_index) >= self.scenario.horizon
+        index = self._index
+        observations = self._observe(acting)
+        terminated = {a: failed[index[a]] for a in acting}
+        truncated = {a: over and not terminated[a] for a in acting}
+        self.agents = [] if over else [a for a in acting if not terminated[a]]
+        return (
+            observations,
+            {a: rewards[index[a]] for a in acting},
+            terminated,
+            truncated,
+            self._infos(acting, error, scored),
+        )
+
+    def state(self) -> np.ndarray:
+        """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
+        return self.world.state()[0].numpy()
+
+    def render(self) -> np.ndarray | None:
+        """The scene now: an RGB array [H, W, 3] uint8, or a window (``human``)."""
+        if self.render_mode is None or self._renderer is None:
+            raise ValueError("render() needs render_mode='rgb_array' or 'human' and a reset()")
+        return self._renderer.render(self.world, self.render_mode)
+
+    def close(self) -> None:
+        """Close the window, if any."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    # ------------------------------------------------------------------ inner
+
+    def _estimates_of(self, actions: Mapping[str, np.ndarray]) -> torch.Tensor:
+        """Actions as one tensor [1, N, A]; a failed UAV's slot is zero."""
+        name, agents = self.scenario.name, self.agents
+        if actions.keys() != set(agents):
+            missing = [a for a in agents if a not in actions]
+            unknown = [a for a in actions if a not in agents]
+            what = f"no action for {missing[0]}" if missing else f"{unknown[0]!r} is not acting"
+            raise ValueError(f"{name}: {what}; agents now: {', '.join(agents)}")
+        try:
+            stacked = np.array([actions[a] for a in agents], dtype=np.float32)
+            fits = stacked.shape == (len(agents), self._width)
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            wrong = next(
+                (a for a in agents if np.shape(actions[a]) != (self._width,)), agents[0]
+            )
+            raise ValueError(
+                f"{name}: the action of {wrong} has shape {np.shape(actions[wrong])}; "
+                f"({self._width},) is needed: [position, velocity, log-std]"
+            )
+        if not np.isfinite(stacked).all():
+            wrong = agents[int(np.flatnonzero(~np.isfinite(stacked).all(1))[0])]
+            raise ValueError(
+                f"{name}: the action of {wrong} holds NaN or infinity; every number must be finite"
+            )
+        if len(agents) < len(self.possible_agents):
+            every = np.zeros((len(self.possible_agents), self._width), np.float32)
+            every[[self._index[a] for a in agents]] = stacked
+            stacked = every
+        return torch.from_numpy(stacked).unsqueeze(0)
+
+    def _observe(self, agents: list[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Each agent's leaves: views of a window that the world never writes to again."""
+        world = self.world
+        if world.sensed is not self._sensed:
+            self._sensed = world.sensed
+            self._leaves = {name: leaf[0].numpy() for name, leaf in world.sensed.leaves.items()}
+        messages, mask = world.messages()
+        now = {name: list(leaf[world.cursor]) for name, leaf in self._leaves.items()}
+        now["messages"], now["message_mask"] = list(messages[0].numpy()), list(mask[0].numpy())
+        names, columns = tuple(now), tuple(now.values())
+        rows = list(zip(*columns, strict=True))
+        index, static = self._index, self._static
+        return {
+            a: dict(zip(names, rows[index[a]], strict=True)) | static[index[a]] for a in agents
+        }
+
+    def _infos(
+        self, agents: list[str], error: np.ndarray, scored: np.ndarray
+    ) -> dict[str, dict[str, float]]:
+        count = np.maximum(self._count, 1)
+        columns = np.stack(
+            (
+                error,
+                scored,
+                np.sqrt(self._sum[1] / count),
+                self._sum[0] / count,
+                self._sum[2],
+            ),
+            axis=1,
+        ).tolist()
+        return {a: dict(zip(INFO_KEYS, columns[self._index[a]], strict=True)) for a in agents}
+
+
+INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
+
+
+def parallel_env(
+    scenario: str | Scenario = "indoor-v0", render_mode: str | None = None, **overrides: Any
+) -> CoLocParallelEnv:
+    """The environment of a scenario id with overrides, or of a Scenario."""
+    if isinstance(scenario, Scenario):
+        if overrides:
+            raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+        return CoLocParallelEnv(scenario, render_mode)
+    return CoLocParallelEnv(make_scenario(scenario, **overrides), render_mode)
+
+
+def env(
+    scenario: str | Scenario = "indoor-v0", render_mode: str | None = None, **overrides: Any
+) -> AECEnv:
+    """The same environment in PettingZoo's agent-environment-cycle form."""
+    return parallel_to_aec(parallel_env(scenario, render_mode, **overrides))

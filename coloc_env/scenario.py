@@ -1,0 +1,138 @@
+"""Scenarios: what is true, and what the team believes, as separate frozen fields."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar
+
+from coloc_env.motion import Arena, Motion
+from coloc_env.network import Network
+from coloc_env.sensors import Sensor
+from coloc_env.sensors.base import Layout, require
+
+REWARDS = ("error", "squared", "team", "log_score")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What each UAV is told about its own start.
+
+    Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
+    world; ``kind="uniform"`` tells nothing of the position but that it lies in the arena.
+    ``yaw_only``: the attitude's error is about the vertical alone.
+    """
+
+    position_std: float = 2.0
+    velocity_std: float = 0.2
+    attitude_std: float = 0.05
+    kind: str = "gaussian"
+
+    def __post_init__(self) -> None:
+        kinds = ("gaussian", "uniform")
+        require(self.kind in kinds, self, "kind", f"one of {', '.join(kinds)}")
+        for name in ("position_std", "velocity_std", "attitude_std"):
+            require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Strapdown integration of the IMU; bias standard deviations > 0 make the biases states.
+
+    ``accel_walk`` (m/s² per √s) and ``gyro_walk`` (rad/s per √s): random walk of the biases.
+    """
+
+    accel_bias: float = 0.0
+    gyro_bias: float = 0.0
+    accel_walk: float = 0.0
+    gyro_walk: float = 0.0
+
+
+@dataclass(frozen=True)
+class Wheeled:
+    """Dead reckoning in the plane from odometry."""
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Velocity driven by white acceleration (``accel_std``, m/s² over one second's square root)
+    and pulled to zero with time constant ``damping`` s (None: not at all)."""
+
+    accel_std: float = 1.0
+    damping: float | None = None
+
+
+Process = Inertial | Wheeled | ConstantVelocity
+S = TypeVar("S", bound=Sensor)
+
+
+@dataclass(frozen=True)
+class Believed:
+    """All that localizers may know: geometry, time step, motion and noise models, never the truth.
+
+    ``anchors_known``: map positions come in the observation's map leaves.
+    """
+
+    arena: Arena
+    slots: int
+    process: Process
+    sensors: tuple[Sensor, ...]
+    prior: Prior
+    message_delay: int = 0
+
+    def sensor(self, kind: type[S]) -> S | None:
+        """The believed model of a sensor type, or None if the team has no such sensor."""
+        return next((s for s in self.sensors if isinstance(s, kind)), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """One task: a world to simulate (or replay) and what its team believes.
+
+    ``failure_rate``: probability that a UAV fails, at a uniformly drawn step, during an episode;
+    ``failures``: ((uav, step), …) for failures at given steps. ``reward``: one of ``REWARDS``.
+    """
+
+    name: str
+    arena: Arena
+    horizon: int
+    motion: Motion
+    sensors: tuple[Sensor, ...]
+    network: Network
+    prior: Prior
+    process: Process
+    believed_sensors: tuple[Sensor, ...]
+    believed_prior: Prior | None = None
+    failure_rate: float = 0.0
+    failures: tuple[tuple[int, int], ...] = ()
+    reward: str = "error"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require(self.horizon >= 1, self, "horizon", "at least one step")
+        require(self.arena.n_uavs >= 1, self.name, "n_uavs", "at least one UAV")
+        require(self.reward in REWARDS, self, "reward", f"one of {', '.join(REWARDS)}")
+        require(0 <= self.failure_rate <= 1, self, "failure_rate", "a probability in [0, 1]")
+        known = all(0 <= uav < self.arena.n_uavs and step >= 1 for uav, step in self.failures)
+        require(known, self, "failures", "((uav index, step ≥ 1), …)")
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What fixes the widths of observation leaves."""
+        return Layout(self.arena, self.network.slots(self.arena.n_uavs))
+
+    @cached_property
+    def believed(self) -> Believed:
+        """What localizers are built from."""
+        return Believed(
+            arena=self.arena,
+            slots=self.layout.slots,
+            process=self.process,
+            sensors=self.believed_sensors,
+            prior=self.believed_prior or self.prior,
+            message_delay=self.network.delay,
+        )
+
+    @property
+    def agents(self) -> list[str]:
+        """Agent ids, ``uav_0`` first."""
+        return [f"uav_{i}" for i in range(self.arena.n_uavs)]

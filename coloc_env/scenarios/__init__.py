@@ -1,0 +1,20 @@
+"""Scenario families, one short file each; importing this package registers them all."""
+
+from coloc_env.scenarios import indoor as _indoor  # noqa: F401
+from coloc_env.scenarios.registry import (
+    FAMILIES,
+    describe,
+    make_scenario,
+    overrides_of,
+    parse_override,
+    register,
+)
+
+__all__ = [
+    "FAMILIES",
+    "describe",
+    "make_scenario",
+    "overrides_of",
+    "parse_override",
+    "register",
+]

@@ -1,0 +1,140 @@
+"""The seam every sensor sits on: one file per modality, no change to World, faces or localizers."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.motion import Arena, Kinematics
+
+MASK = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One 1-D float32 entry of a UAV's observation: its width and the bounds of its Box."""
+
+    width: int
+    low: float = -float("inf")
+    high: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What fixes the widths of leaves: the arena and how many neighbour slots a UAV has."""
+
+    arena: Arena
+    slots: int
+
+
+@dataclass(frozen=True)
+class Window:
+    """What sensors see of R worlds over K steps: truth (float64), who reaches whom, and keys.
+
+    ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
+    step 0). ``keys`` are the (row, step) noise keys. Slot ``s`` of UAV ``i`` holds UAV
+    ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives, message loss aside.
+    """
+
+    layout: Layout
+    motion: Kinematics
+    before: Kinematics
+    keys: Int64[Tensor, "R K"]
+    steps: Int64[Tensor, "R K"]
+    alive: Bool[Tensor, "R K N"]
+    neighbours: Int64[Tensor, "#R #K N S"]
+    reach: Bool[Tensor, "R K N S"]
+    past: dict[int, tuple[Kinematics, Int64[Tensor, "R K"]]] = field(default_factory=dict)
+
+    def delayed(self, delay: int) -> tuple[Kinematics, Int64[Tensor, "R K"]]:
+        """Kinematics and noise keys ``delay`` steps earlier: what a delayed sensor delivers now."""
+        return self.past[delay] if delay else (self.motion, self.keys)
+
+    def uav_keys(self, keys: Int64[Tensor, "R K"], stream: int) -> Int64[Tensor, "R K N"]:
+        """One key per UAV, for a sensor's own events."""
+        index = torch.arange(self.layout.arena.n_uavs, device=keys.device)
+        return noise.fold(keys.unsqueeze(-1), index + stream)
+
+
+class Sensor(ABC):
+    """Base of all sensors: frozen dataclasses whose fields are the sensor's true settings.
+
+    The same class describes what a team *believes* of the sensor (``scenario.believed.sensors``),
+    so a localizer finds the noise model it should assume under the sensor's type.
+    """
+
+    @property
+    def delay(self) -> int:
+        """Steps between sensing and delivery."""
+        return 0
+
+    @abstractmethod
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        """Names and shapes of what the sensor adds to each UAV's observation at every step."""
+
+    def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
+        """Leaves that are constant over an episode (maps)."""
+        return {}
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        """What R worlds draw at reset: landmark positions, biases. Leading size R."""
+        return {}
+
+    def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Values [R, F] of ``map_leaves`` from what was placed."""
+        return {}
+
+    @abstractmethod
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf says so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded(Sensor):
+    """A sensor whose samples come from a recording: step k delivers ``tape[leaf][k]``.
+
+    ``sensor`` describes the leaves; each tape is float32 [T, N, F]; maps are [F].
+    """
+
+    sensor: Sensor
+    tape: dict[str, Tensor]
+    maps: dict[str, Tensor] = field(default_factory=dict)
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return self.sensor.leaves(layout)
+
+    def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return self.sensor.map_leaves(layout)
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        return {
+            name: value.to(keys.device).expand(len(keys), -1) for name, value in self.maps.items()
+        }
+
+    def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        return placed
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        alive = window.alive.unsqueeze(-1)
+        return {
+            name: samples.to(window.steps.device)[window.steps] * alive
+            for name, samples in self.tape.items()
+        }
+
+
+def require(condition: bool, owner: Any, name: str, allowed: str) -> None:
+    """Raise a ValueError that names a wrong setting and what is allowed."""
+    if not condition:
+        kind = type(owner).__name__ if not isinstance(owner, str) else owner
+        value = getattr(owner, name, None)
+        raise ValueError(f"{kind}: {name}={value!r} is not allowed: {allowed}")
+
+
+def squared_norm(x: Float64[Tensor, "*s d"]) -> Float64[Tensor, "*s"]:
+    """Sum of squares over 2 or 3 components in a fixed order, whatever the batch's shape."""
+    total = x[..., 0] * x[..., 0] + x[..., 1] * x[..., 1]
+    return total + x[..., 2] * x[..., 2] if x.shape[-1] == 3 else total

@@ -1,0 +1,112 @@
+"""Range and bearing in the plane: to landmarks, and to other robots that a camera identifies."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.geometry import plane_angle, unrotate, wrap_angle
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
+from coloc_env.sensors.landmarks import uniform_points
+
+
+def range_bearing(
+    apart: Float64[Tensor, "*s 2"], std: tuple[float, float], white: Float32[Tensor, "*s 2"]
+) -> Float32[Tensor, "*s 2"]:
+    """Range (m) and bearing (rad, left of forward) of a body-frame vector, with Gaussian noise."""
+    distance = squared_norm(apart).sqrt()
+    bearing = plane_angle(apart[..., 0], apart[..., 1])
+    clean = torch.stack((distance, bearing), -1).to(torch.float32)
+    noisy = clean + white * white.new_tensor(std)
+    return torch.stack((noisy[..., 0], wrap_angle(noisy[..., 1])), -1)
+
+
+@dataclass(frozen=True)
+class LandmarkBearings(Sensor):
+    """Leaves ``landmark_bearings`` [D · L · 2], their ``landmark_bearing_mask`` [D · L] and
+    ``landmark_map`` [L · 2]: range (m) and bearing (rad) to each identified landmark.
+
+    ``depth`` D: how many measurements of one landmark a step can deliver. ``share``: probability
+    that a landmark within ``radius`` is measured at all in a step.
+    """
+
+    count: int = 15
+    range_std: float = 0.15
+    bearing_std: float = 0.02
+    radius: float = 8.0
+    share: float = 1.0
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        require(self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)")
+        require(0 <= self.share <= 1, self, "share", "a probability in [0, 1]")
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        require(layout.arena.dim == 2, "LandmarkBearings", "dim", "bearings need a 2-D scenario")
+        slots = self.depth * self.count
+        return {"landmark_bearings": Leaf(2 * slots), "landmark_bearing_mask": Leaf(slots, *MASK)}
+
+    def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return {"landmark_map": Leaf(2 * self.count)}
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        return {"positions": uniform_points(keys, "bearings.place", self.count, layout)}
+
+    def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {"landmark_map": placed["positions"].flatten(1).to(torch.float32)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        motion, n, slots = window.motion, window.layout.arena.n_uavs, self.depth * self.count
+        points = placed["positions"].repeat(1, self.depth, 1)[:, None, None]
+        apart = unrotate(motion.attitude.unsqueeze(-2), points - motion.position.unsqueeze(-2))
+        white = noise.normal(window.keys, "bearings", 2 * n * slots).unflatten(-1, (n, slots, 2))
+        drawn = noise.uniform(window.keys, "bearings.share", n * slots).unflatten(-1, (n, slots))
+        mask = (squared_norm(apart) <= self.radius**2) & (drawn < self.share)
+        visible = (mask & window.alive.unsqueeze(-1)).to(torch.float32)
+        seen = range_bearing(apart, (self.range_std, self.bearing_std), white)
+        return {
+            "landmark_bearings": (seen * visible.unsqueeze(-1)).flatten(-2),
+            "landmark_bearing_mask": visible,
+        }
+
+
+@dataclass(frozen=True)
+class UavBearings(Sensor):
+    """Leaves ``uav_bearings`` [D · S · 2] and ``uav_bearing_mask`` [D · S]: range (m) and bearing
+    (rad) to each neighbour slot, each end measuring for itself."""
+
+    range_std: float = 0.15
+    bearing_std: float = 0.02
+    share: float = 1.0
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        require(0 <= self.share <= 1, self, "share", "a probability in [0, 1]")
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        require(layout.arena.dim == 2, "UavBearings", "dim", "bearings need a 2-D scenario")
+        slots = self.depth * layout.slots
+        return {"uav_bearings": Leaf(2 * slots), "uav_bearing_mask": Leaf(slots, *MASK)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        motion, n, slots = window.motion, window.layout.arena.n_uavs, window.layout.slots
+        positions = motion.position.unsqueeze(2).expand(-1, -1, n, -1, -1)
+        index = window.neighbours.expand(*positions.shape[:2], -1, -1)
+        theirs = positions.gather(3, index.unsqueeze(-1).expand(-1, -1, -1, -1, 2))
+        apart = unrotate(motion.attitude.unsqueeze(-2), theirs - motion.position.unsqueeze(-2))
+        apart = apart.repeat(1, 1, 1, self.depth, 1)
+        count = self.depth * slots
+        white = noise.normal(window.keys, "uav_bearings", 2 * n * count)
+        drawn = noise.uniform(window.keys, "uav_bearings.share", n * count)
+        mask = window.reach.repeat(1, 1, 1, self.depth) & (
+            drawn.unflatten(-1, (n, count)) < self.share
+        )
+        visible = mask.to(torch.float32)
+        std = (self.range_std, self.bearing_std)
+        seen = range_bearing(apart, std, white.unflatten(-1, (n, count, 2)))
+        return {
+            "uav_bearings": (seen * visible.unsqueeze(-1)).flatten(-2),
+            "uav_bearing_mask": visible,
+        }

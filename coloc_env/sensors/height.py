@@ -1,0 +1,35 @@
+"""Height above the world's origin, from a downward laser or a barometer."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+
+
+@dataclass(frozen=True)
+class Height(Sensor):
+    """Leaves ``height`` [1] and ``height_mask`` [1]: z in m with Gaussian noise ``std``."""
+
+    std: float = 0.1
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.std >= 0, self, "std", "a standard deviation in m ≥ 0")
+        require(0 <= self.dropout <= 1, self, "dropout", "a probability in [0, 1]")
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        require(layout.arena.dim == 3, "Height", "dim", "a height needs a 3-D scenario")
+        return {"height": Leaf(1), "height_mask": Leaf(1, *MASK)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        z = window.motion.position[..., 2:].to(torch.float32)
+        n = z.shape[-2]
+        mask = window.alive
+        if self.dropout:
+            mask = mask & (noise.uniform(window.keys, "height.dropout", n) >= self.dropout)
+        visible = mask.to(torch.float32).unsqueeze(-1)
+        seen = z + self.std * noise.normal(window.keys, "height", n).unsqueeze(-1)
+        return {"height": seen * visible, "height_mask": visible}

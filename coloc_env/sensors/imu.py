@@ -1,0 +1,60 @@
+"""Inertial measurement unit: specific force and angular rate in the body frame."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.geometry import rotation_between, unrotate
+from coloc_env.sensors.base import Layout, Leaf, Sensor, Window, require
+
+GRAVITY = 9.80665  # m/s², along -z of the world
+
+
+@dataclass(frozen=True)
+class Imu(Sensor):
+    """Leaf ``imu`` [6]: specific force (m/s²) and angular rate (rad/s), body FLU.
+
+    Each sample is the *mean over the step that ends now*, compensated for rotation within it
+    (coning and sculling), in the body frame at the step's start: with no noise, the strapdown
+    update ``q ⊗ exp(ω dt)``, ``v + (R f + g) dt`` leads from one true state to the next exactly.
+    At step 0 no step has passed: the sample is that of a UAV at rest.
+
+    ``accel_std``, ``gyro_std``: white noise of one sample. ``accel_bias``, ``gyro_bias``: standard
+    deviations of a bias drawn once per UAV and world.
+    """
+
+    accel_std: float = 0.05
+    gyro_std: float = 0.01
+    accel_bias: float = 0.0
+    gyro_bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("accel_std", "gyro_std", "accel_bias", "gyro_bias"):
+            require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        require(layout.arena.dim == 3, "Imu", "dim", "an IMU needs a 3-D scenario")
+        return {"imu": Leaf(6)}
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        if not (self.accel_bias or self.gyro_bias):
+            return {}
+        scale = torch.tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3, device=keys.device)
+        bias = noise.normal(keys, "imu.bias", 6 * layout.arena.n_uavs)
+        return {"bias": bias.unflatten(-1, (-1, 6)) * scale}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        now, before, dt = window.motion, window.before, window.layout.arena.dt
+        gravity = now.velocity.new_tensor((0.0, 0.0, GRAVITY))
+        force = unrotate(before.attitude, (now.velocity - before.velocity) / dt + gravity)
+        rate = rotation_between(before.attitude, now.attitude) / dt
+        clean = torch.cat((force, rate), -1).to(torch.float32)
+        white = noise.normal(window.keys, "imu", 6 * clean.shape[-2]).unflatten(-1, (-1, 6))
+        scale = torch.tensor([self.accel_std] * 3 + [self.gyro_std] * 3, device=clean.device)
+        imu = clean + white * scale
+        if "bias" in placed:
+            imu = imu + placed["bias"].unsqueeze(1)
+        return {"imu": imu * window.alive.unsqueeze(-1)}

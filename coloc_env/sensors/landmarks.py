@@ -1,0 +1,107 @@
+"""Landmarks at known positions, seen as relative position vectors in the body frame."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.geometry import rotation_matrix
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+
+
+def uniform_points(
+    keys: Int64[Tensor, "R"], stream: str, count: int, layout: Layout
+) -> Tensor:
+    """Positions [R, count, d] float64, uniform in the arena."""
+    arena = layout.arena
+    unit = noise.uniform(keys, stream, count * arena.dim).unflatten(-1, (count, arena.dim)).double()
+    low = unit.new_tensor(arena.low)
+    return low + unit * (unit.new_tensor(arena.high) - low)
+
+
+@dataclass(frozen=True)
+class Landmarks(Sensor):
+    """Leaves ``landmarks`` [L · d], ``landmark_mask`` [L] and ``landmark_map`` [L · d].
+
+    Entry ``l`` is z = Rᵀ(L_l − p) + N(0, std² I), body frame, metres, for landmarks within
+    ``radius``; landmarks are drawn uniformly in the arena for every world unless ``positions``
+    gives them. ``false_matches``: fraction of measurements that belong to another landmark;
+    ``dropout``: fraction that is missing; ``off``: times (from, to) in s without any.
+    """
+
+    count: int = 20
+    std: float = 0.15
+    radius: float = 10.0
+    false_matches: float = 0.0
+    dropout: float = 0.0
+    off: tuple[float, float] | None = None
+    positions: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        require(self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)")
+        require(self.std >= 0, self, "std", "a standard deviation in m ≥ 0")
+        require(self.radius > 0, self, "radius", "a distance in m > 0")
+        for name in ("false_matches", "dropout"):
+            require(0 <= getattr(self, name) <= 1, self, name, "a fraction in [0, 1]")
+        require(
+            self.off is None or self.off[0] <= self.off[1], self, "off", "(from, to) in s, from ≤ to"
+        )
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return {
+            "landmarks": Leaf(self.count * layout.arena.dim),
+            "landmark_mask": Leaf(self.count, *MASK),
+        }
+
+    def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return {"landmark_map": Leaf(self.count * layout.arena.dim)}
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        if self.positions is None:
+            return {"positions": uniform_points(keys, "landmarks.place", self.count, layout)}
+        given = torch.tensor(self.positions, dtype=torch.float64, device=keys.device)
+        shape = (self.count, layout.arena.dim)
+        require(given.shape == shape, self, "positions", f"{shape[0]} positions of {shape[1]} numbers")
+        return {"positions": given.expand(len(keys), -1, -1)}
+
+    def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {"landmark_map": placed["positions"].flatten(1).to(torch.float32)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        motion, keys, n = window.motion, window.keys, window.layout.arena.n_uavs
+        dim = motion.position.shape[-1]
+        # One contiguous tensor [R, K, N, L] per component: elementwise work at full speed.
+        own = [c.unsqueeze(-1) for c in motion.position.unbind(-1)]
+        points = [c.contiguous()[:, None, None] for c in placed["positions"].unbind(-1)]
+        apart = [(point - p).to(torch.float32) for point, p in zip(points, own, strict=True)]
+        squared = apart[0] * apart[0]
+        for component in apart[1:]:
+            squared = squared.addcmul_(component, component)
+        mask = (squared <= self.radius**2) & window.alive.unsqueeze(-1)
+        if self.false_matches:
+            draws = noise.uniform(keys, "landmarks.false", 2 * n * self.count)
+            wrong, other = draws.unflatten(-1, (2, n, self.count)).unbind(-3)
+            index = torch.arange(self.count, device=keys.device)
+            shift = 1 + (other * (self.count - 1)).to(torch.int64)
+            index = torch.where(wrong < self.false_matches, (index + shift) % self.count, index)
+            apart = [component.gather(-1, index) for component in apart]
+        if self.dropout:
+            missing = noise.uniform(keys, "landmarks.dropout", n * self.count) < self.dropout
+            mask = mask & ~missing.unflatten(-1, (n, self.count))
+        if self.off is not None:
+            time = window.steps * window.layout.arena.dt
+            blind = (time >= self.off[0]) & (time < self.off[1])
+            mask = mask & ~blind[..., None, None]
+        rotation = rotation_matrix(motion.attitude.to(torch.float32))
+        white = noise.normal(keys, "landmarks", n * self.count * dim)
+        seen = white.unflatten(-1, (dim, n, self.count))
+        visible = mask.to(torch.float32)
+        body = []
+        for column in range(dim):
+            value = rotation[..., 0, column, None] * apart[0]
+            for row in range(1, dim):
+                value.addcmul_(rotation[..., row, column, None], apart[row])
+            body.append(value.add_(seen[..., column, :, :], alpha=self.std).mul_(visible))
+        return {"landmarks": torch.stack(body, -1).flatten(-2), "landmark_mask": visible}

@@ -1,0 +1,129 @@
+"""UWB ranging: between UAVs, and from UAVs to fixed anchors."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.geometry import rotate
+from coloc_env.motion import Kinematics
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
+from coloc_env.sensors.range_noise import RangeNoise
+
+Tags = tuple[tuple[tuple[float, ...], ...], ...]
+
+
+def tag_positions(motion: Kinematics, tags: Tags) -> Float64[Tensor, "R K N T d"]:
+    """World positions of each UAV's UWB tags from their lever arms in the body frame."""
+    if not tags:
+        return motion.position.unsqueeze(-2)
+    arms = motion.position.new_tensor(tags)
+    return motion.position.unsqueeze(-2) + rotate(motion.attitude.unsqueeze(-2), arms)
+
+
+@dataclass(frozen=True)
+class Ranging(Sensor):
+    """Leaves ``ranges`` and ``range_mask`` [S · T · T]: distance in m to each neighbour slot.
+
+    Entry ``(s · T + a) · T + b`` is between the UAV's own tag ``a`` and tag ``b`` of the neighbour
+    in slot ``s`` (T = 1 and no lever arm where ``tags`` is empty). Both ends of a link read the
+    same number, drawn once per pair, tags and step. ``latency``: steps between ranging and
+    delivery.
+    """
+
+    noise: RangeNoise = field(default_factory=RangeNoise)
+    tags: Tags = ()
+    latency: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.latency >= 0, self, "latency", "a number of steps ≥ 0")
+
+    @property
+    def delay(self) -> int:
+        return self.latency
+
+    @property
+    def n_tags(self) -> int:
+        return len(self.tags[0]) if self.tags else 1
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        width = layout.slots * self.n_tags**2
+        return {"ranges": Leaf(width), "range_mask": Leaf(width, *MASK)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        motion, keys = window.delayed(self.latency)
+        tags, n, t = tag_positions(motion, self.tags), window.layout.arena.n_uavs, self.n_tags
+        others = window.neighbours
+        index = torch.arange(n * t, device=keys.device).view(n, 1, t, 1)
+        other = others[..., None, None] * t + torch.arange(t, device=keys.device)
+        pair = torch.minimum(index, other) * (n * t) + torch.maximum(index, other)
+        if others.shape[-1] == n:  # slot j is UAV j
+            theirs = tags.unsqueeze(2)
+        else:
+            rows = torch.arange(tags.shape[0], device=keys.device)[:, None, None, None]
+            steps = torch.arange(tags.shape[1], device=keys.device)[:, None, None]
+            theirs = tags[rows, steps, others]
+        apart = tags[..., None, :, None, :] - theirs.unsqueeze(-3)  # [R, K, N, S, T, T, d]
+        link = noise.fold(keys[..., None, None, None, None], pair)
+        ranges, lost = self.noise.sample(squared_norm(apart).sqrt_(), link, "ranging")
+        mask = window.reach[..., None, None].expand(ranges.shape)
+        if self.latency:
+            mask = mask & (window.steps >= self.latency)[..., None, None, None, None]
+        if lost is not None:
+            mask = mask & ~lost
+        mask = mask.to(torch.float32)
+        return {"ranges": (ranges * mask).flatten(-3), "range_mask": mask.flatten(-3)}
+
+
+@dataclass(frozen=True)
+class AnchorRanging(Sensor):
+    """Leaves ``anchor_ranges`` and ``anchor_range_mask`` [T · A], and ``anchor_map`` [A · d].
+
+    Entry ``a · A + m`` is between the UAV's own tag ``a`` and anchor ``m``, within ``radius`` m.
+    """
+
+    anchors: tuple[tuple[float, ...], ...]
+    noise: RangeNoise = field(default_factory=RangeNoise)
+    tags: Tags = ()
+    radius: float | None = None
+
+    def __post_init__(self) -> None:
+        require(len(self.anchors) > 0, self, "anchors", "at least one anchor position")
+        require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
+
+    @property
+    def n_tags(self) -> int:
+        return len(self.tags[0]) if self.tags else 1
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        width = len(self.anchors) * self.n_tags
+        return {"anchor_ranges": Leaf(width), "anchor_range_mask": Leaf(width, *MASK)}
+
+    def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return {"anchor_map": Leaf(len(self.anchors) * layout.arena.dim)}
+
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        anchors = torch.tensor(self.anchors, dtype=torch.float64, device=keys.device)
+        require(anchors.shape[1] == layout.arena.dim, self, "anchors", "positions of the room's dim")
+        return {"anchors": anchors.expand(len(keys), -1, -1)}
+
+    def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {"anchor_map": placed["anchors"].flatten(1).to(torch.float32)}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        tags = tag_positions(window.motion, self.tags)
+        apart = tags.unsqueeze(-2) - placed["anchors"][:, None, None, None]  # [R, K, N, T, A, d]
+        distance = squared_norm(apart).sqrt_()
+        count = distance.shape[-3] * distance.shape[-2] * distance.shape[-1]
+        index = torch.arange(count, device=distance.device).view(distance.shape[-3:])
+        link = noise.fold(window.keys[..., None, None, None], index)
+        ranges, lost = self.noise.sample(distance, link, "anchor_ranging")
+        mask = window.alive[..., None, None].expand(ranges.shape)
+        if self.radius is not None:
+            mask = mask & (distance <= self.radius)
+        if lost is not None:
+            mask = mask & ~lost
+        mask = mask.to(torch.float32)
+        return {"anchor_ranges": (ranges * mask).flatten(-2), "anchor_range_mask": mask.flatten(-2)}
