@@ -132,16 +132,35 @@ def rotation_between(
 
 
 def rotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
-    """A body-frame vector in the world frame, in elementwise operations only."""
-    return _apply(rotation_matrix(attitude), v)
+    """A body-frame vector in the world frame."""
+    if attitude.shape[-1] == 4:
+        w, x, y, z = attitude.unbind(-1)
+        return _turn(w, (x, y, z), v)
+    return _turn_plane(attitude[..., 0].cos(), attitude[..., 0].sin(), v)
 
 
 def unrotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
-    """A world-frame vector in the body frame, in elementwise operations only."""
-    return _apply(rotation_matrix(attitude).mT, v)
+    """A world-frame vector in the body frame."""
+    if attitude.shape[-1] == 4:
+        w, x, y, z = attitude.unbind(-1)
+        return _turn(-w, (x, y, z), v)
+    return _turn_plane(attitude[..., 0].cos(), -attitude[..., 0].sin(), v)
 
 
-def _apply(matrix: Float[Tensor, "*s d d"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
-    products = matrix * v.unsqueeze(-2)
-    total = products[..., 0] + products[..., 1]
-    return total + products[..., 2] if v.shape[-1] == 3 else total
+def _turn(
+    w: Float[Tensor, "*s"], u: tuple[Tensor, Tensor, Tensor], v: Float[Tensor, "*s 3"]
+) -> Float[Tensor, "*s 3"]:
+    """``v + 2w (u × v) + 2u × (u × v)``: a unit quaternion applied to a vector."""
+    (x, y, z), (a, b, c) = u, v.unbind(-1)
+    tx, ty, tz = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return torch.stack(
+        (a + w * tx + (y * tz - z * ty), b + w * ty + (z * tx - x * tz), c + w * tz + (x * ty - y * tx)),
+        -1,
+    )
+
+
+def _turn_plane(
+    cosine: Float[Tensor, "*s"], sine: Float[Tensor, "*s"], v: Float[Tensor, "*s 2"]
+) -> Float[Tensor, "*s 2"]:
+    a, b = v.unbind(-1)
+    return torch.stack((cosine * a - sine * b, sine * a + cosine * b), -1)

@@ -3,34 +3,45 @@
 A world's noise must not depend on how many worlds share its batch, on how many steps are sensed at
 once, or on which other sensors exist. So nothing is ever drawn from a stateful generator: a counter
 is hashed (the SplitMix64 finalizer, Steele, Lea & Flood, OOPSLA 2014), once per row, once per step
-and once per index, and the hash becomes a uniform or, by Box-Muller, a normal number.
+and once per index, and the hash becomes a uniform or a normal number.
 
 Only elementwise operations whose result does not depend on an element's place in memory are used.
 """
 
 import math
 import zlib
+from collections.abc import Callable
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
-_MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
-_MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
+_ROUNDS = (  # shift, mask of the bits a logical shift keeps, odd factor
+    (30, 0x3FFFFFFFF, -4658895280553007687),  # 0xBF58476D1CE4E5B9
+    (27, 0x1FFFFFFFFF, -7723592293110705685),  # 0x94D049BB133111EB
+    (31, 0x1FFFFFFFF, 0),
+)
+_CHUNK = 65536  # 64-bit words hashed at once on a CPU: what stays in cache
 
 
 def mix(z: Int64[Tensor, "*s"]) -> Int64[Tensor, "*s"]:
-    """SplitMix64 finalizer: a bijection of 64-bit integers whose outputs look independent.
+    """SplitMix64 finalizer: a bijection of 64-bit integers whose outputs look independent."""
+    return _mix_(z.clone(), torch.empty_like(z))
+
+
+def _mix_(z: Int64[Tensor, "*s"], shifted: Int64[Tensor, "*s"]) -> Int64[Tensor, "*s"]:
+    """``mix`` in place, with a scratch tensor of the same shape.
 
     torch shifts arithmetically, so the sign bits that a logical shift would clear are masked off.
     """
-    z = z ^ (z >> 30).bitwise_and_(0x3FFFFFFFF)
-    z.mul_(_MIX_1)
-    z.bitwise_xor_((z >> 27).bitwise_and_(0x1FFFFFFFFF))
-    z.mul_(_MIX_2)
-    return z.bitwise_xor_((z >> 31).bitwise_and_(0x1FFFFFFFF))
+    for bits, mask, factor in _ROUNDS:
+        torch.bitwise_right_shift(z, bits, out=shifted)
+        z.bitwise_xor_(shifted.bitwise_and_(mask))
+        if factor:
+            z.mul_(factor)
+    return z
 
 
 def fold(key: Int64[Tensor, "*s"], data: Int64[Tensor, "*s"] | int) -> Int64[Tensor, "*s"]:
@@ -44,56 +55,46 @@ def row_keys(seeds: Int64[Tensor, "B"]) -> Int64[Tensor, "B"]:
 
 
 @lru_cache(maxsize=256)
-def _counters(streams: tuple[tuple[str, int], ...], device: torch.device) -> Int64[Tensor, "n"]:
-    """The constants of each stream's indices, mixed once: what a key is xored with."""
-    parts = []
-    for name, count in streams:
-        base = torch.tensor(zlib.crc32(name.encode()), device=device, dtype=torch.int64)
-        parts.append(fold(base << 20, torch.arange(count, device=device)))
-    return torch.cat(parts)
+def _counters(stream: str, count: int, device: torch.device) -> Int64[Tensor, "n"]:
+    """The constants of a stream's indices, mixed once: what a key is xored with."""
+    base = torch.tensor(zlib.crc32(stream.encode()) << 20, device=device)
+    return fold(base, torch.arange(count, device=device))
 
 
-def bits(keys: Int64[Tensor, "*s"], streams: tuple[tuple[str, int], ...]) -> Int64[Tensor, "*s n"]:
-    """64 random bits per key and index of every ``(stream, count)``, concatenated."""
-    return mix(keys.unsqueeze(-1) ^ _counters(streams, keys.device))
+def _random(
+    keys: Int64[Tensor, "*s"],
+    stream: str,
+    count: int,
+    write: Callable[[Int32[Tensor, "r n"], Float32[Tensor, "r n"]], None],
+) -> Float32[Tensor, "*s n"]:
+    """``count`` numbers per key: ``write`` turns random 32-bit integers into floats, in place."""
+    words = (count + 1) // 2
+    counters, flat = _counters(stream, words, keys.device), keys.reshape(-1, 1)
+    out = torch.empty(len(flat), 2 * words, device=keys.device)
+    rows = max(1, _CHUNK // words) if keys.device.type == "cpu" else max(1, len(flat))
+    for start in range(0, len(flat), rows):
+        bits = flat[start : start + rows] ^ counters
+        _mix_(bits, torch.empty_like(bits))
+        write(bits.view(torch.int32), out[start : start + rows])
+    return out[:, :count].view(*keys.shape, count)
 
 
-def _unit(word: Int64[Tensor, "*s"]) -> Float[Tensor, "*s"]:
-    """32-bit integers in [-2^31, 2^31) to float32 in (0, 1): 23 bits, never 0 and never 1."""
-    return (word >> 9).to(torch.float32).add_(2**22 + 0.5).mul_(2.0**-23)
+def _write_uniform(bits: Int32[Tensor, "r n"], out: Float32[Tensor, "r n"]) -> None:
+    """(b + ½) / 2²³ for 23-bit integers b: every value exact, never 0 and never 1."""
+    out.copy_(bits.bitwise_right_shift_(9)).add_(0.5).mul_(2.0**-23).add_(0.5)
 
 
-def _halves(word: Int64[Tensor, "*s n"]) -> tuple[Tensor, Tensor]:
-    """Both signed 32-bit halves of each word."""
-    pairs = word.view(torch.int32).unflatten(-1, (-1, 2))
-    return pairs[..., 0], pairs[..., 1]
+def _write_normal(bits: Int32[Tensor, "r n"], out: Float32[Tensor, "r n"]) -> None:
+    """Inverse distribution function: √2 erf⁻¹(u) of 24-bit u in (−1, 1); at most 5.4 σ."""
+    out.copy_(bits.bitwise_right_shift_(8)).add_(0.5).mul_(2.0**-23)
+    out.erfinv_().mul_(math.sqrt(2.0))
 
 
-def uniform(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float[Tensor, "*s n"]:
+def uniform(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float32[Tensor, "*s n"]:
     """``count`` float32 numbers in (0, 1) per key."""
-    return _unit((bits(keys, ((stream, count),)) >> 32).to(torch.int32))
+    return _random(keys, stream, count, _write_uniform)
 
 
-def normal(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float[Tensor, "*s n"]:
+def normal(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float32[Tensor, "*s n"]:
     """``count`` standard normal float32 numbers per key."""
-    return normals(keys, ((stream, count),))[stream]
-
-
-def normals(
-    keys: Int64[Tensor, "*s"], streams: tuple[tuple[str, int], ...]
-) -> dict[str, Float[Tensor, "*s n"]]:
-    """Standard normal float32 numbers for several streams in one pass (Box-Muller, two a hash).
-
-    Within a stream the first half of the numbers are the cosine, the second half the sine branch.
-    """
-    halves = tuple((name, (count + 1) // 2) for name, count in streams)
-    low, high = _halves(bits(keys, halves))
-    radius = _unit(low).log_().mul_(-2.0).sqrt_()
-    angle = _unit(high).mul_(2.0 * math.pi)
-    cosine, sine = angle.cos().mul_(radius), angle.sin_().mul_(radius)
-    out, start = {}, 0
-    for (name, count), (_, half) in zip(streams, halves, strict=True):
-        stop = start + half
-        out[name] = torch.cat((cosine[..., start:stop], sine[..., start:stop]), -1)[..., :count]
-        start = stop
-    return out
+    return _random(keys, stream, count, _write_normal)

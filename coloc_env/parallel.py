@@ -74,9 +74,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._next_seed = seed + 1
         self.agents = list(self.possible_agents)
         self.world.reset([seed])
-        self._sum = np.zeros((3, len(self.agents)))  # of errors, of their squares; the largest
-        self._count = np.zeros(len(self.agents))
-        self._estimates = torch.zeros(1, len(self.agents), self._width)
+        n = len(self.agents)
+        self._count, self._sum, self._squares, self._largest = np.zeros((4, n))
         self._static = [
             {name: leaf[0, i].numpy().copy() for name, leaf in self.world.static.items()}
             for i in range(len(self.agents))
@@ -84,8 +83,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._sensed = None
         if self.render_mode is not None:
             self._renderer = Renderer(self.scenario)
-        zeros = np.zeros(len(self.agents))
-        infos = self._infos(self.agents, zeros, zeros)
+        infos = self._infos(self.agents, np.zeros(n), np.zeros(n))
         return self._observe(self.agents), infos
 
     def step(
@@ -108,26 +106,17 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         step = world.step(estimates)
-        error, scored = step.error[0].numpy(), step.scored[0].numpy()
-        self._count += scored
-        self._sum[0] += error
-        self._sum[1] += error * error
-        np.maximum(self._sum[2], error, out=self._sum[2])
-        rewards = step.reward[0].tolist()
-        failed = step.terminated[0].tolist()
-        over = int(world.step_index) >= self.scenario.horizon
-        index = self._index
+        infos = self._infos(acting, step.error[0].numpy(), step.scored[0].numpy())
         observations = self._observe(acting)
+        rewards, failed = step.reward[0].tolist(), step.terminated[0].tolist()
+        over, index = bool(step.truncated), self._index
         terminated = {a: failed[index[a]] for a in acting}
         truncated = {a: over and not terminated[a] for a in acting}
-        self.agents = [] if over else [a for a in acting if not terminated[a]]
-        return (
-            observations,
-            {a: rewards[index[a]] for a in acting},
-            terminated,
-            truncated,
-            self._infos(acting, error, scored),
-        )
+        if over:
+            self.agents = []
+        elif any(failed):
+            self.agents = [a for a in acting if not terminated[a]]
+        return observations, {a: rewards[index[a]] for a in acting}, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
         """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
@@ -186,30 +175,28 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             self._sensed = world.sensed
             self._leaves = {name: leaf[0].numpy() for name, leaf in world.sensed.leaves.items()}
         messages, mask = world.messages()
-        now = {name: list(leaf[world.cursor]) for name, leaf in self._leaves.items()}
-        now["messages"], now["message_mask"] = list(messages[0].numpy()), list(mask[0].numpy())
-        names, columns = tuple(now), tuple(now.values())
-        rows = list(zip(*columns, strict=True))
-        index, static = self._index, self._static
-        return {
-            a: dict(zip(names, rows[index[a]], strict=True)) | static[index[a]] for a in agents
-        }
+        now = [leaf[world.cursor] for leaf in self._leaves.values()]
+        rows = zip(*now, messages[0].numpy(), mask[0].numpy(), strict=True)
+        names = (*self._leaves, "messages", "message_mask")
+        every = [
+            dict(zip(names, row, strict=True)) | static
+            for row, static in zip(rows, self._static, strict=True)
+        ]
+        return {a: every[self._index[a]] for a in agents}
 
     def _infos(
         self, agents: list[str], error: np.ndarray, scored: np.ndarray
     ) -> dict[str, dict[str, float]]:
+        self._count += scored
+        self._sum += error
+        self._squares += error * error
+        np.maximum(self._largest, error, out=self._largest)
         count = np.maximum(self._count, 1)
-        columns = np.stack(
-            (
-                error,
-                scored,
-                np.sqrt(self._sum[1] / count),
-                self._sum[0] / count,
-                self._sum[2],
-            ),
-            axis=1,
-        ).tolist()
-        return {a: dict(zip(INFO_KEYS, columns[self._index[a]], strict=True)) for a in agents}
+        columns = np.array(
+            (error, scored, np.sqrt(self._squares / count), self._sum / count, self._largest)
+        )
+        every = [dict(zip(INFO_KEYS, column, strict=True)) for column in columns.T.tolist()]
+        return {a: every[self._index[a]] for a in agents}
 
 
 INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")

@@ -23,7 +23,7 @@ from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
 from coloc_env.sense import Past, Sensed, draw_prior, sense
 
-_AGENT_STEPS = 1536  # (row, step, UAV) items sensed at once: what stays in cache
+_AGENT_STEPS = 6144  # (row, step, UAV) items sensed at once: what stays in cache
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,17 @@ class World:
         self.batch_size = batch_size
         self.device = torch.device(device)
         ahead = _AGENT_STEPS // (batch_size * scenario.arena.n_uavs)
-        self.window = window or max(1, min(ahead, 64))
+        self.window = window or max(1, min(ahead, 128))
         self._rows = max(1, _AGENT_STEPS // (self.window * scenario.arena.n_uavs))
         if self.device.type != "cpu":
             self._rows = batch_size
         self._delay = scenario.network.delay
         self._static_names = tuple(static_leaves(scenario))
         self.cursor = -1
+        self._can_fail = bool(scenario.failure_rate or scenario.failures)
+        self._none_failed = torch.zeros(
+            batch_size, scenario.arena.n_uavs, dtype=torch.bool, device=self.device
+        )
         self._sent: deque[Tensor] = deque(maxlen=self._delay + 1)
 
     # ---------------------------------------------------------------- reset
@@ -95,6 +99,7 @@ class World:
             self._sense(self.window, None)
         else:
             self._reset_rows(seeds, rows.nonzero()[:, 0])
+        self._since_reset = 0
         return self.observation()
 
     def _place(self, seeds: Int64[Tensor, "B"]) -> None:
@@ -187,14 +192,15 @@ class World:
         The next step's measurements are ``observation()``.
         """
         error, scored = self.score(estimates)
-        value = reward(self.scenario.reward, estimates, self.truth.position, error, scored)
+        position = self.sensed.position[:, self.cursor]
+        value = reward(self.scenario.reward, estimates, position, error, scored)
         alive = self.alive
         self.advance(estimates)
         return Step(
             reward=value,
             error=error,
             scored=scored,
-            terminated=alive & ~self.alive,
+            terminated=alive & ~self.alive if self._can_fail else self._none_failed,
             truncated=self.step_index >= self.scenario.horizon,
         )
 
@@ -213,6 +219,7 @@ class World:
         self._sent.append(estimates)
         self.step_index = self.step_index + 1
         self.cursor += 1
+        self._since_reset += 1
         if self.cursor == self.sensed.count:
             self.cursor = 0
             self._sense(self.window, self._past)
@@ -249,9 +256,9 @@ class World:
         if len(self._sent) <= self._delay:
             b, n, s = links.shape
             return links.new_zeros(b, n, s * width), torch.zeros_like(links)
-        sent = self._sent[0]
-        arrived = (self.step_index > self._delay)[:, None, None]
-        mask = links * arrived
+        sent, mask = self._sent[0], links
+        if self._since_reset <= self._delay:
+            mask = links * (self.step_index > self._delay)[:, None, None]
         neighbours = self.sensed.neighbours(self.cursor)
         if neighbours is None:
             content = sent.unsqueeze(1)

@@ -6,20 +6,31 @@ from pathlib import Path
 
 import numpy as np
 
-from coloc_env.datasets.files import DataError, FileFormat, Rows, fail, read
-from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
+from coloc_env.datasets.recording import IMU_COLUMNS, Recording, Table, Track, one_hemisphere
 
 SOURCE = (
     "EuRoC MAV; Burri, Nikolic, Gohl, Schneider, Rehder, Omari, Achtelik, Siegwart, "
     "IJRR 35(10):1157-1163, 2016; research use, see ETH ASL for the terms"
 )
-IMU_COLUMNS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 _IMU = FileFormat(IMU_COLUMNS, "nanoseconds", ",")
 _TRUTH = FileFormat(
-    tuple("px py pz qw qx qy qz vx vy vz gbx gby gbz abx aby abz".split()), "nanoseconds", ","
+    (
+        *("position_x", "position_y", "position_z"),
+        *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),
+        *("velocity_x", "velocity_y", "velocity_z"),
+        *("gyro_bias_x", "gyro_bias_y", "gyro_bias_z"),
+        *("accel_bias_x", "accel_bias_y", "accel_bias_z"),
+    ),
+    "nanoseconds",
+    ",",
 )
-# The IMU's axes are up, right, forward; the body's are forward, left, up.
+# The IMU's axes are up, right, forward; the body's are forward, left, up: half a turn about
+# (1, 0, 1). _TURN is the product with its quaternion (0, 1, 0, 1)/sqrt(2) from the right.
 _TO_BODY = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+_TURN = np.sqrt(0.5) * np.array(
+    [[0.0, 1.0, 0.0, 1.0], [-1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0], [-1.0, 0.0, 1.0, 0.0]]
+)
 
 
 def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> Recording:
@@ -33,24 +44,25 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     does. The truth (200 Hz, but 20 Hz in OpenVINS's V1_01_easy) is itself a batch estimate that
     used the IMU. Stream: imu.
 
-    Measured, with the truth's biases taken off, over 0.1 s: gyro against the truth's rotation, robust
-    deviation below 3 mrad/s; accelerometer against its velocity below 0.1 m/s^2.
+    Measured over 0.1 s, biases as in the truth taken off, sensor minus truth, robust deviation a
+    axis: gyro 1 to 2 mrad/s, accelerometer 0.02 to 0.05 m/s^2, no bias beyond 0.04.
 
     Raises:
-        DataError: no folder, folders of different rooms (their names differ before the first
-            ``_``), a file that is missing or damaged, a quaternion that is not of unit length.
+        DataError: no folder, the same one twice, folders of different rooms (names that differ
+            before the first ``_``), a file that is missing or damaged.
     """
     if isinstance(folders, str | os.PathLike):
         folders = [folders]
     paths = [Path(folder) for folder in folders]
-    if len({room(path.name) for path in paths}) != 1:
-        names = ", ".join(path.name for path in paths)
-        raise DataError(f"EuRoC sequences of one room make a team, these do not: {names or 'none'}")
+    names = tuple(path.name for path in paths)
+    if len(set(map(room, names))) != 1 or len(set(names)) != len(names):
+        given = ", ".join(names) or "none"
+        raise DataError(f"a EuRoC team is made of different sequences of one room, not {given}")
     tracks, tables = zip(*map(_sequence, paths), strict=True)
     return Recording(
-        name="euroc/" + "+".join(path.name for path in paths),
+        name="euroc/" + "+".join(names),
         dim=3,
-        robots=tuple(path.name for path in paths),
+        robots=names,
         truth=tracks,
         streams={"imu": tables},
         landmarks=np.empty((0, 3)),
@@ -60,26 +72,44 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     )
 
 
+def robots_in(folder: Path) -> tuple[str, ...]:
+    """The one robot of a sequence, which is called like it."""
+    return (folder.name,) if _truth_file(folder).is_file() else ()
+
+
 def room(sequence: str) -> str:
     """The room a sequence was flown in: the part of its name before the first ``_``."""
     return sequence.split("_")[0]
 
 
 def _sequence(folder: Path) -> tuple[Track, Table]:
-    path = _either(folder, "groundtruth.csv", "mav0/state_groundtruth_estimate0/data.csv")
+    path = _truth_file(folder)
     truth = read(path, _TRUTH)
-    attitude = truth.values[:, 3:7]
-    length = np.linalg.norm(attitude, axis=1)
+    length = np.linalg.norm(truth.values[:, 3:7], axis=1)
     if (bad := np.abs(length - 1) > 0.01).any():
-        fail(path, _TRUTH, bad, f"the quaternion has length {length[bad][0]:.3f}")
-    imu = read(_either(folder, "imu0.csv", "mav0/imu0/data.csv"), _IMU)
-    zero = truth.time[0]
-    return _track(truth, zero), _imu(imu, zero)
+        fail(path, _TRUTH, bad, f"the quaternion has length {length[bad][0]:.3f}, not 1")
+    imu = read(_either(folder, "mav0/imu0/data.csv", "imu0.csv"), _IMU)
+    turned = np.concatenate((imu.values[:, :3] @ _TO_BODY.T, imu.values[:, 3:] @ _TO_BODY.T), 1)
+    return _track(truth), Table(imu.time - truth.time[0], turned, IMU_COLUMNS)
 
 
-def _track(truth: Rows, zero: np.int64) -> Track:
-    raise NotImplementedError
+def _truth_file(folder: Path) -> Path:
+    return _either(folder, "mav0/state_groundtruth_estimate0/data.csv", "groundtruth.csv")
 
 
-def _imu(imu: Rows, zero: np.int64) -> Table:
-    raise NotImplementedError
+def _either(folder: Path, published: str, plain: str) -> Path:
+    """The file as ETH publishes it where it exists, else the plain one."""
+    return folder / published if (folder / published).is_file() else folder / plain
+
+
+def _track(truth: Rows) -> Track:
+    time, values = distinct(truth)
+    attitude = values[:, 3:7] @ _TURN
+    return Track(
+        time=time - time[0],
+        position=values[:, :3],
+        attitude=one_hemisphere(attitude / np.linalg.norm(attitude, axis=1, keepdims=True)),
+        velocity=values[:, 7:10],
+        gyro_bias=values[:, 10:13] @ _TO_BODY.T,
+        accel_bias=values[:, 13:16] @ _TO_BODY.T,
+    )

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_env.datasets.recording import Floats, Stamps
+from coloc_env.datasets.recording import Flags, Floats, Stamps
 
 HOMES = {
     "mrclam": "http://asrl.utias.utoronto.ca/datasets/mrclam/",
@@ -126,7 +126,13 @@ def read(path: Path, form: FileFormat) -> Rows:
     return rows
 
 
-def fail(path: Path, form: FileFormat, bad: NDArray[np.bool_], reason: str) -> NoReturn:
+def distinct(rows: Rows) -> Rows:
+    """Of samples that share a stamp, the first."""
+    time, first = np.unique(rows.time, return_index=True)
+    return Rows(time, rows.values[first])
+
+
+def fail(path: Path, form: FileFormat, bad: Flags, reason: str) -> NoReturn:
     """Raise a DataError that names the line of the first data row that is ``bad``."""
     line, _ = next(islice(_lines(path, form), int(bad.argmax()), None))
     raise DataError(f"{path}, line {line}: {reason}")
@@ -252,7 +258,7 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _cached(entry: Path, version: NDArray[np.int64], columns: int) -> Rows | None:
+def _cached(entry: Path, version: Stamps, columns: int) -> Rows | None:
     """What the cache holds for this version of a file; None if nothing that can be used."""
     try:
         with np.load(entry, allow_pickle=False) as saved:
@@ -265,7 +271,7 @@ def _cached(entry: Path, version: NDArray[np.int64], columns: int) -> Rows | Non
     return rows if sound else None
 
 
-def _store(entry: Path, version: NDArray[np.int64], rows: Rows) -> None:
+def _store(entry: Path, version: Stamps, rows: Rows) -> None:
     """Write a cache entry whole or not at all; a folder that cannot be written is no error."""
     with contextlib.suppress(OSError):
         entry.parent.mkdir(parents=True, exist_ok=True)

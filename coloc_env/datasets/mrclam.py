@@ -1,11 +1,12 @@
 """UTIAS MRCLAM: ground robots that see barcodes on landmarks and on each other, in the plane."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from coloc_env.datasets.files import DataError, FileFormat, Rows, fail, read
+from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
 from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
 
 SOURCE = (
@@ -36,15 +37,18 @@ def load_mrclam(folder: str | os.PathLike[str]) -> Recording:
         DataError: a file is missing or damaged, or barcodes are not unique.
     """
     folder = Path(folder)
-    robots = _robots(folder)
+    robots = robots_in(folder)
+    if not robots:
+        raise DataError(f"{folder}: no RobotN_Groundtruth.dat")
+    subjects = [int(robot.removeprefix("Robot")) for robot in robots]
     landmark_rows = read(folder / "Landmark_Groundtruth.dat", _LANDMARKS).values
     landmark_rows = landmark_rows[np.argsort(landmark_rows[:, 0], kind="stable")]
-    landmark_of, robot_of = _targets(folder, list(robots), landmark_rows[:, 0])
+    landmark_of, robot_of = _targets(folder, subjects, landmark_rows[:, 0])
 
-    tracks = [read(folder / f"{robot}_Groundtruth.dat", _TRUTH) for robot in robots.values()]
+    tracks = [read(folder / f"{robot}_Groundtruth.dat", _TRUTH) for robot in robots]
     zero = min(rows.time[0] for rows in tracks)
     odometry, landmark_bearings, uav_bearings = [], [], []
-    for robot in robots.values():
+    for robot in robots:
         wheels = read(folder / f"{robot}_Odometry.dat", _ODOMETRY)
         odometry.append(Table(wheels.time - zero, wheels.values, _ODOMETRY.columns))
         sightings = _without_repeats(read(folder / f"{robot}_Measurement.dat", _SIGHTINGS))
@@ -54,7 +58,7 @@ def load_mrclam(folder: str | os.PathLike[str]) -> Recording:
     return Recording(
         name=f"mrclam/{folder.name}",
         dim=2,
-        robots=tuple(robots.values()),
+        robots=robots,
         truth=tuple(_track(rows, zero) for rows in tracks),
         streams={
             "odometry": tuple(odometry),
@@ -68,17 +72,15 @@ def load_mrclam(folder: str | os.PathLike[str]) -> Recording:
     )
 
 
-def _robots(folder: Path) -> dict[int, str]:
-    """Subject number to name of every robot."""
+def robots_in(folder: Path) -> tuple[str, ...]:
+    """The robots of a dataset, in the order of their subject numbers."""
     names = [path.name.split("_")[0] for path in folder.glob("Robot*_Groundtruth.dat")]
-    numbers = sorted(int(name[5:]) for name in names if name[5:].isdigit())
-    if not numbers:
-        raise DataError(f"{folder}: no RobotN_Groundtruth.dat")
-    return {number: f"Robot{number}" for number in numbers}
+    names = [name for name in names if name.removeprefix("Robot").isdigit()]
+    return tuple(sorted(names, key=lambda name: int(name.removeprefix("Robot"))))
 
 
 def _targets(
-    folder: Path, robots: list[int], landmarks: Floats
+    folder: Path, robots: Sequence[int], landmarks: Floats
 ) -> tuple[dict[float, int], dict[float, int]]:
     """Barcode to landmark index, and barcode to robot index."""
     path = folder / "Barcodes.dat"
@@ -88,7 +90,7 @@ def _targets(
         if len(first) < len(rows):
             again = ~np.isin(np.arange(len(rows)), first)
             fail(path, _BARCODES, again, f"{name} {rows[again][0, column]:g} stands there twice")
-    barcode = dict(rows)
+    barcode = dict(zip(rows[:, 0], rows[:, 1], strict=True))
     return (
         {barcode[subject]: i for i, subject in enumerate(landmarks) if subject in barcode},
         {barcode[subject]: i for i, subject in enumerate(robots) if subject in barcode},
@@ -96,20 +98,18 @@ def _targets(
 
 
 def _track(rows: Rows, zero: np.int64) -> Track:
-    """Of samples that share a stamp the first counts."""
-    time, first = np.unique(rows.time, return_index=True)
-    values = rows.values[first]
+    time, values = distinct(rows)
     return Track(time - zero, values[:, :2], np.unwrap(values[:, 2:], axis=0))
 
 
 def _without_repeats(rows: Rows) -> Rows:
-    whole = np.column_stack((rows.time.view(np.float64), rows.values))
+    whole = np.column_stack((rows.time - rows.time[0], rows.values))
     kept = np.sort(np.unique(whole, axis=0, return_index=True)[1])
     return Rows(rows.time[kept], rows.values[kept])
 
 
 def _bearings(time: Stamps, sightings: Floats, index: dict[float, int], column: str) -> Table:
     """The sightings of barcodes in ``index``, the barcode replaced by its index."""
-    seen = np.array([index.get(barcode, -1) for barcode in sightings[:, 0]])
+    seen = np.array([index.get(barcode, -1) for barcode in sightings[:, 0]], int)
     values = np.column_stack((seen, sightings[:, 1:]))[seen >= 0]
     return Table(time[seen >= 0], values, (column, "range", "bearing"))

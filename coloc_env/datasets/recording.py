@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+IMU_COLUMNS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +132,13 @@ class Recording:
                 raise ValueError(f"Recording.{what} has shape {array.shape}, not [n, {self.dim}]")
         if self.tags.ndim != 3 or self.tags.shape[::2] != (robots, self.dim):
             raise ValueError(f"Recording.tags has shape {self.tags.shape}, not [{robots}, K, d]")
+
+
+def one_hemisphere(quaternions: Floats) -> Floats:
+    """The same rotations [T, 4] with signs such that no two successive ones are opposed."""
+    turns = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    signs = np.cumprod(np.where(turns, -1.0, 1.0))
+    return np.concatenate((quaternions[:1], quaternions[1:] * signs[:, None]))
 
 
 def _check_time(time: Stamps, samples: int, *, strictly: bool) -> None:

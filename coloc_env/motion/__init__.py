@@ -1,20 +1,51 @@
-# TEMP by lead, to be overwritten
-import math, torch
-from dataclasses import dataclass
+"""Where the truth's motion comes from: scripted, random and recorded motion behind one seam.
+
+All motions are frozen dataclasses. A setting left at ``None`` is fitted to the arena; one that is
+given is kept, or refused with a ``ValueError`` that says what fits. Velocity is the derivative of
+position, in closed form. Positions in m, times in s, angles in rad, z up.
+"""
+
+from coloc_env.motion.aggressive import Aggressive
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.geometry import yaw_quaternion
-@dataclass(frozen=True)
-class Circle(Motion):
-    speed: float = 0.5
-    rate: float = 0.15
-    def start(self, keys, arena): return {}
-    def advance(self, carry, steps, arena):
-        n=arena.n_uavs
-        ph=torch.arange(n,device=steps.device,dtype=torch.float64)*(2*math.pi/n)
-        a=(steps*(arena.dt*self.rate)).unsqueeze(-1)+ph
-        c,s=a.cos(),a.sin(); r=self.speed/self.rate
-        cx,cy,_=arena.centre
-        p=torch.stack((cx+r*c,cy+r*s,1.5+0.3*s),-1)
-        v=torch.stack((-self.speed*s,self.speed*c,0.3*self.rate*c),-1)
-        return Kinematics(p,v,yaw_quaternion(a+math.pi/2)),carry
-MOTIONS={"circle":Circle()}
+from coloc_env.motion.curves import Circle, FigureEight, Helix
+from coloc_env.motion.formation import FormationChange
+from coloc_env.motion.lanes import Line, Square
+from coloc_env.motion.random_circles import RandomCircles
+from coloc_env.motion.random_velocity import RandomVelocity
+from coloc_env.motion.recorded import Recorded
+from coloc_env.motion.stop_and_go import StopAndGo
+from coloc_env.motion.waypoints import Waypoints
+
+MOTIONS: dict[str, Motion] = {
+    "circle": Circle(),
+    "line": Line(),
+    "helix": Helix(),
+    "figure_eight": FigureEight(),
+    "square": Square(),
+    "random": RandomCircles(),
+    "waypoints": Waypoints(),
+    "aggressive": Aggressive(),
+    "stop_and_go": StopAndGo(),
+    "formation": FormationChange(),
+    "random_velocity": RandomVelocity(),
+}
+
+__all__ = [
+    "MOTIONS",
+    "Aggressive",
+    "Arena",
+    "Carry",
+    "Circle",
+    "FigureEight",
+    "FormationChange",
+    "Helix",
+    "Kinematics",
+    "Line",
+    "Motion",
+    "RandomCircles",
+    "RandomVelocity",
+    "Recorded",
+    "Square",
+    "StopAndGo",
+    "Waypoints",
+]

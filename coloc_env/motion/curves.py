@@ -10,7 +10,7 @@ from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
 from coloc_env.motion.draws import phases
 from coloc_env.motion.fit import altitude, at_most, half_extents, only_3d, positive
 from coloc_env.motion.frames import level_flight, unit
-from coloc_env.motion.timing import StopAndGoLaw, seconds
+from coloc_env.motion.timing import StopAndGoLaw, alternating, seconds
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Helix(Motion):
         rise = 2 * half_extents(self, arena, self.margin)[2]
         law = StopAndGoLaw(rise / self.climb - self.ramp, self.ramp, self.pause)
         leg, distance, rate, _ = law.at(time / law.period + 2 * share)
-        up = 1 - 2 * (leg - 2 * (0.5 * leg).floor())
+        up = alternating(leg)
         position = (
             arena.centre[0] + radius * cosine,
             arena.centre[1] + radius * sine,
@@ -113,8 +113,8 @@ class Helix(Motion):
 class FigureEight(Motion):
     """Gerono's lemniscate x = a sin θ, y = ½ a sin 2θ, height swinging with cos θ.
 
-    ``max_speed`` is reached at the crossing. An even team is spread over N + 1 places, so that no two
-    UAVs meet at the crossing.
+    ``max_speed`` is reached at the crossing. An even team is spread over N + 1 places, so that no
+    two UAVs meet there.
     """
 
     max_speed: float = 1.0  # horizontal, m/s

@@ -46,18 +46,29 @@ def yaw_attitude(
     forward = cosine >= 0
     w = torch.where(forward, larger, smaller.abs())
     z = torch.where(forward, smaller, torch.copysign(larger, sine))
-    level = torch.zeros_like(w)
-    return torch.stack((w, level, level, z), -1)
+    return columns((w, 0.0, 0.0, z), w)
+
+
+def columns(components: Sequence[Tensor | float], like: Float64[Tensor, "*s"]) -> Tensor:
+    """Vectors from their components, each broadcast to ``like``; faster than ``torch.stack``."""
+    vectors = like.new_empty((*like.shape, len(components)))
+    for axis, component in enumerate(components):
+        vectors[..., axis] = component
+    return vectors
 
 
 def level_flight(
-    position: Sequence[Float64[Tensor, "R K N"]],
-    velocity: Sequence[Float64[Tensor, "R K N"]],
+    position: Sequence[Tensor | float],
+    velocity: Sequence[Tensor | float],
     ahead: tuple[Float64[Tensor, "R K N"], Float64[Tensor, "R K N"]],
 ) -> Kinematics:
-    """Kinematics from components, level, with the x axis along the unit vector ``ahead``."""
+    """Kinematics from components, level, with the x axis along the unit vector ``ahead``.
+
+    ``ahead`` gives the shape; the components may be smaller tensors or plain numbers.
+    """
+    like = ahead[0]
     attitude = yaw_attitude(*ahead, len(position))
-    return Kinematics(torch.stack(list(position), -1), torch.stack(list(velocity), -1), attitude)
+    return Kinematics(columns(position, like), columns(velocity, like), attitude)
 
 
 def thrust_attitude(
@@ -76,7 +87,7 @@ def thrust_attitude(
     force = (fx * fx + fy * fy + fz * fz).sqrt()
     zx, zy, zz = fx / force, fy / force, fz / force
     w = (0.5 * zz + 0.5).sqrt()
-    tilt = torch.stack((w, -0.5 * zy / w, 0.5 * zx / w, torch.zeros_like(w)), -1)
+    tilt = columns((w, -0.5 * zy / w, 0.5 * zx / w, 0.0), w)
     along = (zx * cosine + zy * sine) / (1 + zz)
     yaw = yaw_attitude(*unit(cosine - along * zx, sine - along * zy), 3)
     attitude = quaternion_product(tilt, yaw)

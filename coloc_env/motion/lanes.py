@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
@@ -10,7 +11,7 @@ from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
 from coloc_env.motion.draws import phases
 from coloc_env.motion.fit import altitude, at_most, half_extents, positive
 from coloc_env.motion.frames import level_flight
-from coloc_env.motion.timing import StopAndGoLaw, cycles, seconds
+from coloc_env.motion.timing import StopAndGoLaw, alternating, cycles, seconds
 
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 
@@ -19,8 +20,9 @@ _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 class Line(Motion):
     """Parallel lanes along x, flown back and forth at constant speed; UAVs turn round at rest.
 
-    Lanes are spread evenly over the arena's width, and over its height in a mixed order, so that the
-    team is not in one plane. Peak acceleration 1.875 ``speed`` / ``ramp``.
+    Lanes are spread evenly over the arena's width, and over its height in a mixed order; UAV i is
+    i / N of a round trip ahead: the team is never in one plane. Peak acceleration
+    1.875 ``speed`` / ``ramp``.
     """
 
     speed: float = 0.5  # m/s
@@ -36,24 +38,25 @@ class Line(Motion):
         altitude(self, arena, self.height)
         share = phases(keys, arena.n_uavs, arena.n_uavs)
         across = arena.centre[1] + halves[1] * (2 * share + 1 / arena.n_uavs - 1)
-        carry = {"y": across}
+        carry = {"legs": 2 * share, "y": across}
         if arena.dim == 3:
             mixed = cycles(_GOLDEN * arena.n_uavs * share)[1]
             spread = arena.centre[2] + halves[2] * (2 * mixed - 1)
-            carry["z"] = spread if self.height is None else share * 0 + self.height
+            carry["z"] = spread if self.height is None else torch.full_like(spread, self.height)
         return carry
 
     def advance(
         self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
     ) -> tuple[Kinematics, Carry]:
-        time = seconds(steps, arena.dt) + 0 * carry["y"].unsqueeze(1)
         length = 2 * half_extents(self, arena, self.margin)[0]
         law = StopAndGoLaw(length / self.speed - self.ramp, self.ramp, self.pause)
-        leg, distance, rate, turned = law.at(time / law.period)
-        forth = 1 - 2 * (leg - 2 * (0.5 * leg).floor())
-        position = [arena.centre[0] + forth * (self.speed * distance - 0.5 * length)]
-        position += [carry[axis].unsqueeze(1).expand_as(time) for axis in "yz" if axis in carry]
-        velocity = [forth * (self.speed * rate), *(0 * time,) * (arena.dim - 1)]
+        leg, distance, rate, turned = law.at(
+            seconds(steps, arena.dt) / law.period + carry["legs"].unsqueeze(1)
+        )
+        forth = alternating(leg)
+        x = arena.centre[0] + forth * (self.speed * distance - 0.5 * length)
+        position = (x, *(carry[axis].unsqueeze(1) for axis in "yz"[: arena.dim - 1]))
+        velocity = (forth * (self.speed * rate), *(0.0, 0.0)[: arena.dim - 1])
         yaw = math.pi * turned
         return level_flight(position, velocity, (forth * yaw.cos(), forth * yaw.sin())), carry
 
@@ -105,13 +108,12 @@ class Square(Motion):
             yaw = 0.5 * math.pi * (leg + turned)
         leg = leg - 4 * (0.25 * leg).floor()
         x, y = _around(leg + covered)
-        position = [corner[0] + side * x, corner[1] + side * y]
+        position = [corner[0] + side * x, corner[1] + side * y, altitude(self, arena, self.height)]
         pace = side * rate
-        east, north = (leg == 0).double() - (leg == 2).double(), (leg == 1).double() - (leg == 3).double()
-        velocity = [pace * east, pace * north]
-        if arena.dim == 3:
-            position.append(0 * x + altitude(self, arena, self.height))
-            velocity.append(0 * x)
+        east = (leg == 0).double() - (leg == 2).double()
+        north = (leg == 1).double() - (leg == 3).double()
+        velocity = [pace * east, pace * north, 0.0]
+        position, velocity = position[: arena.dim], velocity[: arena.dim]
         return level_flight(position, velocity, (yaw.cos(), yaw.sin())), carry
 
     def _law(self) -> StopAndGoLaw:

@@ -18,8 +18,8 @@ from coloc_env.motion.timing import seconds
 class RandomCircles(Motion):
     """Circles whose centre, radius, direction, phase, height, swing and speed are drawn uniformly.
 
-    Drawn per world and UAV, such that the circle keeps a margin from the walls. The height swings once
-    a turn with a phase of its own; yaw along the velocity.
+    Drawn per world and UAV, such that the circle keeps a margin from the walls. The height swings
+    once a turn with a phase of its own; yaw along the velocity.
     """
 
     speed: tuple[float, float] = (0.2, 1.0)  # horizontal, m/s

@@ -17,8 +17,8 @@ from coloc_env.motion.timing import StopAndGoLaw, seconds
 class StopAndGo(Motion):
     """A circle about the arena's centre on which each UAV stops, in its own turn, and goes on.
 
-    UAV i starts at angle 2π i / N, i / N of a cycle ahead. The yaw stays on the circle's tangent
-    while a UAV rests. Peak tangential acceleration 1.875 ``speed`` / ``ramp``.
+    UAV i is 2π i / N ahead on the average, and i / N of a cycle in its stops. The yaw stays on the
+    circle's tangent while it rests. Peak tangential acceleration 1.875 ``speed`` / ``ramp``.
     """
 
     speed: float = 0.5  # horizontal, m/s, while going
@@ -45,7 +45,7 @@ class StopAndGo(Motion):
         cycle, distance, pace, _ = law.at(seconds(steps, arena.dt) / law.period + share)
         radius = self._radius(arena)
         rate = self.speed / radius
-        phase = rate * (law.travel * cycle + distance) + 2 * math.pi * share
+        phase = rate * (law.travel * (cycle - share) + distance) + 2 * math.pi * share
         height = altitude(self, arena, self.height, self.height_amplitude)
         return circle(phase, rate * pace, radius, arena, height, self.height_amplitude), carry
 

@@ -23,6 +23,11 @@ def cycles(
     return whole, turns - whole
 
 
+def alternating(cycle: Float64[Tensor, "*s"]) -> Float64[Tensor, "*s"]:
+    """1 in even cycles, −1 in odd ones."""
+    return 1 - 2 * (cycle - 2 * (0.5 * cycle).floor())
+
+
 def minimum_jerk(u: Float64[Tensor, "*s"]) -> tuple[Float64[Tensor, "*s"], Float64[Tensor, "*s"]]:
     """From 0 to 1, at rest outside 0 < u < 1: s = 10 u³ − 15 u⁴ + 6 u⁵, and ds/du."""
     u = u.clamp(0.0, 1.0)
@@ -32,7 +37,7 @@ def minimum_jerk(u: Float64[Tensor, "*s"]) -> tuple[Float64[Tensor, "*s"], Float
 
 @dataclass(frozen=True)
 class StopAndGoLaw:
-    """Speed that repeats: rises for ``ramp``, holds 1 for ``cruise``, falls, rests for ``pause`` (s).
+    """Speed that repeats: up to 1 in ``ramp``, ``cruise``, down in ``ramp``, rest for ``pause`` (s).
 
     The ramps are minimum-jerk, so acceleration is continuous, with peak 1.875 / ramp.
     """

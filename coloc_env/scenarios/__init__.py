@@ -3,7 +3,6 @@
 from coloc_env.scenarios import indoor as _indoor  # noqa: F401
 from coloc_env.scenarios.registry import (
     FAMILIES,
-    describe,
     make_scenario,
     overrides_of,
     parse_override,
@@ -12,7 +11,6 @@ from coloc_env.scenarios.registry import (
 
 __all__ = [
     "FAMILIES",
-    "describe",
     "make_scenario",
     "overrides_of",
     "parse_override",

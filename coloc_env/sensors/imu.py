@@ -51,10 +51,9 @@ class Imu(Sensor):
         gravity = now.velocity.new_tensor((0.0, 0.0, GRAVITY))
         force = unrotate(before.attitude, (now.velocity - before.velocity) / dt + gravity)
         rate = rotation_between(before.attitude, now.attitude) / dt
-        clean = torch.cat((force, rate), -1).to(torch.float32)
-        white = noise.normal(window.keys, "imu", 6 * clean.shape[-2]).unflatten(-1, (-1, 6))
-        scale = torch.tensor([self.accel_std] * 3 + [self.gyro_std] * 3, device=clean.device)
-        imu = clean + white * scale
+        imu = noise.normal(window.keys, "imu", 6 * window.layout.arena.n_uavs).unflatten(-1, (-1, 6))
+        imu[..., :3].mul_(self.accel_std).add_(force)
+        imu[..., 3:].mul_(self.gyro_std).add_(rate)
         if "bias" in placed:
-            imu = imu + placed["bias"].unsqueeze(1)
-        return {"imu": imu * window.alive.unsqueeze(-1)}
+            imu.add_(placed["bias"].unsqueeze(1))
+        return {"imu": imu.mul_(window.alive.unsqueeze(-1))}

@@ -95,13 +95,12 @@ class Landmarks(Sensor):
             blind = (time >= self.off[0]) & (time < self.off[1])
             mask = mask & ~blind[..., None, None]
         rotation = rotation_matrix(motion.attitude.to(torch.float32))
-        white = noise.normal(keys, "landmarks", n * self.count * dim)
-        seen = white.unflatten(-1, (dim, n, self.count))
         visible = mask.to(torch.float32)
-        body = []
+        seen = noise.normal(keys, "landmarks", n * self.count * dim)
+        seen = seen.unflatten(-1, (n, self.count, dim)).mul_(self.std)
         for column in range(dim):
             value = rotation[..., 0, column, None] * apart[0]
             for row in range(1, dim):
                 value.addcmul_(rotation[..., row, column, None], apart[row])
-            body.append(value.add_(seen[..., column, :, :], alpha=self.std).mul_(visible))
-        return {"landmarks": torch.stack(body, -1).flatten(-2), "landmark_mask": visible}
+            seen[..., column].add_(value).mul_(visible)
+        return {"landmarks": seen.flatten(-2), "landmark_mask": visible}

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -44,7 +44,7 @@ class RangeNoise:
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
 
     def sample(
-        self, distance: Float64[Tensor, "*s"], keys: Int64[Tensor, "*s"], stream: str
+        self, distance: Float32[Tensor, "*s"], keys: Int64[Tensor, "*s"], stream: str
     ) -> tuple[Float32[Tensor, "*s"], Bool[Tensor, "*s"] | None]:
         """Ranges in m and which of them were lost (None: none can be)."""
 
@@ -70,4 +70,4 @@ class RangeNoise:
             size = (2 * draw("impulse.size") - 1) * self.impulse_size
             error = error + torch.where(chance(self.impulse, "impulse"), size, 0.0)
         lost = chance(self.dropout, "dropout") if self.dropout else None
-        return distance.to(torch.float32) + error, lost
+        return error.add_(distance), lost

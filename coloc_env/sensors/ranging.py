@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -21,6 +21,25 @@ def tag_positions(motion: Kinematics, tags: Tags) -> Float64[Tensor, "R K N T d"
         return motion.position.unsqueeze(-2)
     arms = motion.position.new_tensor(tags)
     return motion.position.unsqueeze(-2) + rotate(motion.attitude.unsqueeze(-2), arms)
+
+
+def tag_distances(
+    tags: Float64[Tensor, "R K N T d"], others: Int64[Tensor, "R K N S"] | None
+) -> Float32[Tensor, "R K N S T T"]:
+    """Distances between own tags and the tags of the UAV in each slot (None: slot j is UAV j).
+
+    Subtracted in float64, one component at a time; then float32 is exact enough.
+    """
+    if others is not None:
+        rows = torch.arange(tags.shape[0], device=tags.device)[:, None, None, None]
+        steps = torch.arange(tags.shape[1], device=tags.device)[:, None, None]
+    squared = None
+    for own in tags.unbind(-1):
+        theirs = own.unsqueeze(2) if others is None else own[rows, steps, others]
+        apart = (own[:, :, :, None, :, None] - theirs.unsqueeze(-2)).to(torch.float32)
+        squared = apart.mul_(apart) if squared is None else squared.addcmul_(apart, apart)
+    assert squared is not None
+    return squared.sqrt_()
 
 
 @dataclass(frozen=True)
@@ -59,15 +78,9 @@ class Ranging(Sensor):
         index = torch.arange(n * t, device=keys.device).view(n, 1, t, 1)
         other = others[..., None, None] * t + torch.arange(t, device=keys.device)
         pair = torch.minimum(index, other) * (n * t) + torch.maximum(index, other)
-        if others.shape[-1] == n:  # slot j is UAV j
-            theirs = tags.unsqueeze(2)
-        else:
-            rows = torch.arange(tags.shape[0], device=keys.device)[:, None, None, None]
-            steps = torch.arange(tags.shape[1], device=keys.device)[:, None, None]
-            theirs = tags[rows, steps, others]
-        apart = tags[..., None, :, None, :] - theirs.unsqueeze(-3)  # [R, K, N, S, T, T, d]
+        distance = tag_distances(tags, None if others.shape[-1] == n else others)
         link = noise.fold(keys[..., None, None, None, None], pair)
-        ranges, lost = self.noise.sample(squared_norm(apart).sqrt_(), link, "ranging")
+        ranges, lost = self.noise.sample(distance, link, "ranging")
         mask = window.reach[..., None, None].expand(ranges.shape)
         if self.latency:
             mask = mask & (window.steps >= self.latency)[..., None, None, None, None]
@@ -115,7 +128,7 @@ class AnchorRanging(Sensor):
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         tags = tag_positions(window.motion, self.tags)
         apart = tags.unsqueeze(-2) - placed["anchors"][:, None, None, None]  # [R, K, N, T, A, d]
-        distance = squared_norm(apart).sqrt_()
+        distance = squared_norm(apart).sqrt_().to(torch.float32)
         count = distance.shape[-3] * distance.shape[-2] * distance.shape[-1]
         index = torch.arange(count, device=distance.device).view(distance.shape[-3:])
         link = noise.fold(window.keys[..., None, None, None], index)

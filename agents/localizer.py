@@ -1,0 +1,107 @@
+"""The Localizer protocol, its estimates, and the registry of localizers by name."""
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorClass
+from torch import Tensor
+
+from coloc_env import options
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed, Scenario
+
+
+class Estimate(TensorClass["nocast"]):
+    """What each UAV says of its own state at the step observed; world frame, batch (B, N).
+
+    ``position`` (m), ``velocity`` (m/s), ``covariance`` of the position (m²).
+    """
+
+    position: Float[Tensor, "B N d"]
+    velocity: Float[Tensor, "B N d"]
+    covariance: Float[Tensor, "B N d d"]
+
+    def action(self) -> Float[Tensor, "B N A"]:
+        """The environment's action ``[position, velocity, log-std]``, float32."""
+        variance = self.covariance.diagonal(dim1=-2, dim2=-1)
+        log_std = 0.5 * variance.clamp_min(1e-12).log()
+        return torch.cat((self.position, self.velocity, log_std), -1).to(torch.float32)
+
+
+Belief = TypeVar("Belief")
+
+
+class Localizer(ABC, Generic[Belief]):
+    """An estimator as a pure function of belief and observation, for all UAVs of all worlds at once.
+
+    A belief is a tensorclass of batch (B, N) that holds all there is, the key of the UAV's own
+    random numbers and its step count included; the localizer itself holds settings only. UAV i's
+    part of a belief is computed from UAV i's observation and belief alone, or from what its
+    ``links`` let through (``centralized`` localizers, which are references, aside).
+    """
+
+    name: ClassVar[str]
+    centralized: ClassVar[bool] = False
+
+    def __init__(self, believed: Believed) -> None:
+        self.believed = believed
+
+    @abstractmethod
+    def reset(self, observation: Observation) -> Belief:
+        """The belief before the first observation is used: the prior that it carries."""
+
+    @abstractmethod
+    def step(self, belief: Belief, observation: Observation) -> tuple[Belief, Estimate]:
+        """Predict to the observation's step (the first time: not at all), then use it.
+
+        Pure: neither argument is written to.
+        """
+
+    def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
+        """A method's own figures at this step (particles, effective sample size, …)."""
+        return {}
+
+
+Factory = Callable[..., Localizer]
+LOCALIZERS: dict[str, Factory] = {}
+_L = TypeVar("_L", bound=Factory)
+
+
+def register(name: str) -> Callable[[_L], _L]:
+    """Register a localizer: a callable of ``believed`` and keyword-only options."""
+
+    def add(factory: _L) -> _L:
+        LOCALIZERS[name] = factory
+        return factory
+
+    return add
+
+
+def options_of(name: str) -> dict[str, inspect.Parameter]:
+    """Option names of a localizer with their types and defaults."""
+    if name not in LOCALIZERS:
+        raise ValueError(options.unknown("agent", name, sorted(LOCALIZERS)))
+    return options.parameters(LOCALIZERS[name])
+
+
+def make(name: str, scenario: Scenario, **chosen: Any) -> Localizer:
+    """Build a localizer for what the scenario's team believes.
+
+    ``name`` may carry options as on the command line (``"ekf:robust=huber"``). Raises ValueError,
+    in one line that names what is allowed, for an unknown name or option.
+    """
+    name, *texts = name.split(":")
+    known = options_of(name)
+    for text in texts:
+        key, value = options.parse(name, text, known)
+        chosen.setdefault(key, value)
+    options.check(name, chosen, known)
+    try:
+        return LOCALIZERS[name](scenario.believed, **chosen)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error

@@ -1,0 +1,203 @@
+"""Reading text files: exact times, errors that name the line, the cache."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coloc_env.datasets import files
+from coloc_env.datasets.files import DataError, FileFormat, distinct, fail, read
+
+SECONDS = FileFormat(("x", "n"), "seconds", whole=("n",))
+NANOSECONDS = FileFormat(("x", "n"), "nanoseconds", ",", whole=("n",))
+NAMED = FileFormat(("x", "n"), "relative seconds", ",", header=True, whole=("n",))
+GOOD = {
+    SECONDS: "# t x n\n1248444175.103 \t 2.5 \t 7\n\n1248444175.115  -1e-3  8\n1248444175.2 1 9\n",
+    NANOSECONDS: "#t,x,n\n1403715273262142976,2.5,7\n1403715273262142977,-1e-3,8\n"
+    "1403715273262142977,1,9\n",
+    NAMED: 'n,text,timestamp,x\n7,"a, b",1e-09,2.5\n8,"[1 2\n 3]",1e-06,-1e-3\n9,c,1.5,1\n',
+}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COLOC_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "recorded.txt"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "time"),
+    [
+        (SECONDS, [1248444175103000000, 1248444175115000000, 1248444175200000000]),
+        (NANOSECONDS, [1403715273262142976, 1403715273262142977, 1403715273262142977]),
+        (NAMED, [1, 1000, 1500000000]),
+    ],
+)
+def test_good_file(tmp_path: Path, form: FileFormat, time: list[int]) -> None:
+    rows = read(write(tmp_path, GOOD[form]), form)
+    assert rows.time.tolist() == time
+    assert rows.values.tolist() == [[2.5, 7.0], [-1e-3, 8.0], [1.0, 9.0]]
+
+
+def test_windows_line_ends_and_no_last_one(tmp_path: Path) -> None:
+    path = tmp_path / "dos.txt"
+    path.write_bytes(GOOD[SECONDS].rstrip().replace("\n", "\r\n").encode())
+    assert len(read(path, SECONDS).time) == 3
+
+
+@given(stamps=st.lists(st.integers(0, 8_999_999_999_999_999_999), min_size=1))
+def test_times_are_exact(tmp_path_factory: pytest.TempPathFactory, stamps: list[int]) -> None:
+    folder = tmp_path_factory.mktemp("times")
+    stamps.sort()
+    seconds = [f"{t // 10**9}.{t % 10**9:09d} 1 1" for t in stamps]
+    assert read(write(folder, "\n".join(seconds)), SECONDS).time.tolist() == stamps
+    whole = [f"{t},1,1" for t in stamps]
+    assert read(write(folder, "\n".join(whole)), NANOSECONDS).time.tolist() == stamps
+
+
+@pytest.mark.parametrize(
+    ("form", "old", "new", "reason"),
+    [
+        (SECONDS, "-1e-3  8", "-1e-3", "line 4: 2 columns, not 3"),
+        (SECONDS, "-1e-3  8", "-1e-3 8 8", "line 4: 4 columns, not 3"),
+        (SECONDS, "-1e-3", "1.2.3", "line 4: x is '1.2.3', not a number"),
+        (SECONDS, "-1e-3", "nan", "line 4: x is not a finite number"),
+        (SECONDS, "-1e-3", "1e999", "line 4: x is not a finite number"),
+        (SECONDS, "8\n", "8.5\n", "line 4: n is 8.5, not a whole number"),
+        (SECONDS, "175.115", "175.102", "line 4: the time is before that of the line above"),
+        (SECONDS, "1248444175.115", "1.25e9", "line 4: the time is 1.25e9, not seconds since 1970"),
+        (SECONDS, "1248444175.115", "nan", "line 4: the time is nan, not seconds since 1970"),
+        (SECONDS, ".115", ".1150000001", "line 4: the time is 1248444175.1150000001, not"),
+        (SECONDS, "1248444175.115", "-1.5", "line 4: the time is -1.5, not seconds since 1970"),
+        (SECONDS, "1248444175.115", "99999999999.5", "line 4: the time is 99999999999.5, not"),
+        (NANOSECONDS, "977,-1", ".5,-1", "line 3: the time is 1403715273262142.5, not nanosec"),
+        (NANOSECONDS, "-1e-3,8", "-1e-3", "line 3: 2 columns, not 3"),
+        (NANOSECONDS, "-1e-3", "", "line 3: x is '', not a number"),
+        (NAMED, "timestamp", "time", "line 1: the header does not name one column 'timestamp'"),
+        (NAMED, "text", "x", "line 1: the header does not name one column 'x'"),
+        (NAMED, ",c,", ",", "line 5: 3 columns, not 4"),
+        (NAMED, ",c,", ",c,c,", "line 5: 5 columns, not 4"),
+        (NAMED, "c,1.5", "c,nan", "line 5: the time is nan, not relative seconds"),
+        (NAMED, "c,1.5", "c,1706818860.5", "line 5: the time is 1.70682e+09, not relative"),
+        (NAMED, "c,1.5", "c,-1", "line 5: the time is before that of the line above"),
+        (NAMED, "9,c", "nine,c", "line 5: n is 'nine', not a number"),
+        (NAMED, "9,c", '9,"c', "line 5: 2 columns, not 4"),
+    ],
+)
+def test_damage_is_located(
+    tmp_path: Path, form: FileFormat, old: str, new: str, reason: str
+) -> None:
+    assert GOOD[form].count(old) == 1
+    path = write(tmp_path, GOOD[form].replace(old, new))
+    with pytest.raises(DataError) as caught:
+        read(path, form)
+    assert str(caught.value).startswith(f"{path}, {reason}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("form", GOOD)
+@pytest.mark.parametrize("content", [b"", b"\n\n", b"# only a comment\n", b"x,n,timestamp\n"])
+def test_nothing_in_it(tmp_path: Path, form: FileFormat, content: bytes) -> None:
+    path = tmp_path / "empty"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"no data|line 1"):
+        read(path, form)
+
+
+@pytest.mark.parametrize("form", GOOD)
+def test_foreign_files(tmp_path: Path, form: FileFormat) -> None:
+    path = tmp_path / "foreign"
+    for content in [b"\x80\x81\xff\x00PNG\r\n", *(GOOD[f].encode() for f in GOOD if f != form)]:
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=str(path)):
+            read(path, form)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"away\.txt: no such file"):
+        read(tmp_path / "away.txt", SECONDS)
+
+
+def test_fail_counts_data_rows(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD[SECONDS])
+    with pytest.raises(DataError, match="line 5: because"):
+        fail(path, SECONDS, np.array([False, False, True]), "because")
+
+
+def test_distinct_keeps_the_first(tmp_path: Path) -> None:
+    rows = distinct(read(write(tmp_path, GOOD[NANOSECONDS]), NANOSECONDS))
+    assert rows.values[:, 1].tolist() == [7.0, 8.0]
+
+
+def test_cache_is_used_and_renewed(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path, GOOD[SECONDS])
+    first = read(path, SECONDS)
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "_parse", lambda *_: pytest.fail("parsed again"))
+        again = read(path, SECONDS)
+    np.testing.assert_array_equal(first.time, again.time)
+    np.testing.assert_array_equal(first.values, again.values)
+    path.write_text(GOOD[SECONDS].replace("2.5", "3.5"), encoding="utf-8")
+    os.utime(path, ns=(0, 0))
+    assert read(path, SECONDS).values[0, 0] == 3.5
+    assert len(list(cache.iterdir())) == 1
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "garbage", "other", "bit"])
+def test_damaged_cache_is_rebuilt(tmp_path: Path, cache: Path, damage: str) -> None:
+    path = write(tmp_path, GOOD[SECONDS])
+    first = read(path, SECONDS)
+    (entry,) = cache.iterdir()
+    content = bytearray(entry.read_bytes())
+    if damage == "bit":
+        content[content.index(np.float64(2.5).tobytes())] ^= 1
+    if damage == "other":
+        with entry.open("wb") as file:
+            np.savez(file, version=np.zeros(3))
+    else:
+        kinds = {"empty": b"", "cut": content[:300], "garbage": b"x" * 99, "bit": content}
+        entry.write_bytes(kinds[damage])
+    np.testing.assert_array_equal(read(path, SECONDS).values, first.values)
+    with np.load(entry) as saved:
+        np.testing.assert_array_equal(saved["values"], first.values)
+
+
+def test_cache_that_cannot_be_written_is_no_error(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache.write_text("a file where the folder should be", encoding="utf-8")
+    assert len(read(write(tmp_path, GOOD[SECONDS]), SECONDS).time) == 3
+
+
+def test_data_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLOC_DATA", str(tmp_path))
+    assert files.data_root() == tmp_path
+    assert files.data_root(tmp_path.parent) == tmp_path.parent
+    for call in (lambda: files.data_root(tmp_path / "away"), lambda: files.dataset_folder("euroc")):
+        with pytest.raises(DataError, match=r"COLOC_DATA or --data.* \(from http") as caught:
+            call()
+        assert str(tmp_path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_data_root_without_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLOC_DATA", raising=False)
+    module = tmp_path / "checkout" / "coloc_env" / "datasets" / "files.py"
+    monkeypatch.setattr(files, "__file__", str(module))
+    with pytest.raises(DataError, match="no folder of recordings is known"):
+        files.data_root()
+    module.parent.mkdir(parents=True)
+    (tmp_path / "checkout" / "pyproject.toml").touch()
+    (tmp_path / "shared" / "data").mkdir(parents=True)
+    assert files.data_root() == tmp_path / "shared" / "data"

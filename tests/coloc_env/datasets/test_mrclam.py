@@ -1,0 +1,126 @@
+"""MRCLAM files in miniature: what is read, what is dropped, what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from coloc_env.datasets import DataError, load_mrclam
+
+FILES = {
+    "Barcodes.dat": "# Subject # Barcode #\n 1 5\n 3 14\n 6 63\n 7 81\n 9 99\n",
+    "Landmark_Groundtruth.dat": "# Subject x y\n 7 2.0 3.0 0.1 0.1\n 6 0.5 -4.0 0.1 0.1\n",
+    "Robot1_Groundtruth.dat": "# Time x y heading\n100.100 1.0 2.0 3.1\n100.200 1.1 2.0 -3.1\n"
+    "100.200 9.0 9.0 0.0\n100.300 1.2 2.0 -3.0\n",
+    "Robot1_Odometry.dat": "# Time v w\n100.050 0.1 0.0\n100.150 0.2 0.1\n100.150 0.3 0.1\n",
+    "Robot1_Measurement.dat": "# Time barcode range bearing\n100.100 81 1.5 0.1\n"
+    "100.100 63 2.5 0.2\n100.100 14 3.5 0.3\n100.100 77 4.5 0.4\n100.100 81 1.5 0.1\n"
+    "100.250 81 1.5 0.1\n",
+    "Robot3_Groundtruth.dat": "# Time x y heading\n100.000 1.0 2.0 0.0\n",
+    "Robot3_Odometry.dat": "# Time v w\n100.000 0.1 0.0\n",
+    "Robot3_Measurement.dat": "# Time barcode range bearing\n100.100 5 1.5 0.1\n",
+}
+MS = 1_000_000
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLOC_CACHE", str(tmp_path / "cache"))
+
+
+def write(folder: Path, **changes: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, content in FILES.items():
+        (folder / name).write_text(changes.get(name.removesuffix(".dat"), content))
+    return folder
+
+
+def test_what_is_read(tmp_path: Path) -> None:
+    recording = load_mrclam(write(tmp_path / "MRCLAM_Dataset0"))
+    assert recording.name == "mrclam/MRCLAM_Dataset0"
+    assert (recording.dim, recording.robots) == (2, ("Robot1", "Robot3"))
+    assert recording.landmarks.tolist() == [[0.5, -4.0], [2.0, 3.0]]
+    assert (recording.anchors.shape, recording.tags.shape) == ((0, 2), (2, 0, 2))
+    track = recording.truth[0]
+    assert track.time.tolist() == [100 * MS, 200 * MS, 300 * MS]
+    assert track.position.tolist() == [[1.0, 2.0], [1.1, 2.0], [1.2, 2.0]]
+    np.testing.assert_allclose(track.attitude[:, 0], [3.1, 2 * np.pi - 3.1, 2 * np.pi - 3.0])
+    odometry = recording.streams["odometry"][0]
+    assert odometry.columns == ("v", "omega")
+    assert odometry.time.tolist() == [50 * MS, 150 * MS, 150 * MS]
+    assert odometry.values[:, 0].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_sightings_are_sorted_out(tmp_path: Path) -> None:
+    streams = load_mrclam(write(tmp_path / "x")).streams
+    landmarks = streams["landmark_bearings"][0]
+    assert landmarks.columns == ("landmark", "range", "bearing")
+    assert landmarks.time.tolist() == [100 * MS, 100 * MS, 250 * MS]
+    assert landmarks.values.tolist() == [[1, 1.5, 0.1], [0, 2.5, 0.2], [1, 1.5, 0.1]]
+    assert streams["landmark_bearings"][1].values.shape == (0, 3)
+    first, second = streams["uav_bearings"]
+    assert first.columns == ("robot", "range", "bearing")
+    assert first.values.tolist() == [[1, 3.5, 0.3]]
+    assert second.values.tolist() == [[0, 1.5, 0.1]]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "reason"),
+    [
+        ("Barcodes", "9 99", "9 81", "line 6: barcode 81 stands there twice"),
+        ("Barcodes", "9 99", "3 99", "line 6: subject 3 stands there twice"),
+        ("Barcodes", "9 99", "9 99.5", "line 6: barcode is 99.5, not a whole number"),
+        ("Landmark_Groundtruth", "0.5 -4.0 0.1 0.1", "0.5 -4.0", "line 3: 3 columns, not 5"),
+        ("Robot1_Measurement", "63 2.5 0.2", "63 2.5", "line 3: 3 columns, not 4"),
+        ("Robot1_Measurement", "63 2.5", "63 two", "line 3: range is 'two', not a number"),
+        ("Robot1_Groundtruth", "2.0 -3.1", "nan -3.1", "line 3: y is not a finite number"),
+        ("Robot1_Odometry", "0.3", "0.3 0.3", "line 4: 4 columns, not 3"),
+        ("Robot3_Odometry", "# Time v w\n100.000 0.1 0.0\n", "", "Robot3_Odometry.dat: no data"),
+    ],
+)
+def test_damage_is_located(tmp_path: Path, file: str, old: str, new: str, reason: str) -> None:
+    content = FILES[f"{file}.dat"]
+    assert content.count(old) == 1
+    with pytest.raises(DataError) as caught:
+        load_mrclam(write(tmp_path / "x", **{file: content.replace(old, new)}))
+    assert reason in str(caught.value)
+    assert f"{file}.dat" in str(caught.value)
+
+
+def test_foreign_file(tmp_path: Path) -> None:
+    euroc = "#timestamp,w,w,w,a,a,a\n1403715273262142976,0,0,0,0,0,9.8\n"
+    with pytest.raises(DataError, match=r"Robot1_Odometry\.dat, line 2: 1 columns, not 3"):
+        load_mrclam(write(tmp_path / "x", Robot1_Odometry=euroc))
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_missing_file(tmp_path: Path, name: str) -> None:
+    folder = write(tmp_path / "x")
+    (folder / name).unlink()
+    if name.endswith("_Groundtruth.dat") and name.startswith("Robot"):
+        assert len(load_mrclam(folder).robots) == 1
+        return
+    with pytest.raises(DataError, match=f"{name}: no such file"):
+        load_mrclam(folder)
+
+
+def test_no_dataset(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no RobotN_Groundtruth"):
+        load_mrclam(tmp_path / "away")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_damage_is_read_or_a_data_error(tmp_path: Path, data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(sorted(FILES)))
+    content = FILES[name]
+    start = data.draw(st.integers(0, len(content)))
+    end = data.draw(st.integers(start, min(start + 8, len(content))))
+    text = data.draw(st.text("0123456789.-+e# \n\t\"',;nax", max_size=4))
+    changed = content[:start] + text + content[end:]
+    try:
+        load_mrclam(write(tmp_path / "x", **{name.removesuffix(".dat"): changed}))
+    except DataError as error:
+        assert "\n" not in str(error)
