@@ -1,0 +1,7 @@
+"""Localizers and policies; importing this package registers every localizer."""
+
+from agents import ekf as _ekf  # noqa: F401
+from agents import ekf_joint as _ekf_joint  # noqa: F401
+from agents.localizer import LOCALIZERS, Estimate, Localizer, make, options_of, register
+
+__all__ = ["LOCALIZERS", "Estimate", "Localizer", "make", "options_of", "register"]

@@ -261,7 +261,7 @@ def _digest(text: str) -> str:
 def _cached(entry: Path, version: Stamps, columns: int) -> Rows | None:
     """What the cache holds for this version of a file; None if nothing that can be used."""
     try:
-        with np.load(entry, allow_pickle=False) as saved:
+        with entry.open("rb") as file, np.load(file, allow_pickle=False) as saved:
             if not np.array_equal(saved["version"], version):
                 return None
             rows = Rows(saved["time"], saved["values"])

@@ -7,8 +7,8 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.motion.draws import constant, fold_each, uav_keys, uniform
-from coloc_env.motion.fit import at_most, half_extents, positive
+from coloc_env.motion.draws import constant, fold_each, following, uav_keys, uniform
+from coloc_env.motion.fit import half_extents, positive
 from coloc_env.motion.frames import GRAVITY, thrust_attitude, yaw_attitude
 from coloc_env.motion.timing import cycles, seconds
 
@@ -26,13 +26,14 @@ PEAKS = (115 / 96, 2.0, 4.5)
 
 @dataclass(frozen=True)
 class Aggressive(Motion):
-    """A slow random spline through the room and a fast one about it, z axis along the thrust.
+    """A slow drift through the room and fast manoeuvres about it, body z axis along the thrust.
 
-    Both are uniform quintic B-splines (four continuous derivatives) with control points drawn per
-    world and UAV in boxes that add up to the room less its margin, which they therefore never leave.
-    The slow one may use a third of each limit, the fast one two thirds. Limits bound the vectors'
-    lengths strictly; REACHED. The yaw wanders slowly, independent of the velocity, so it is defined
-    at zero speed.
+    The drift is a sine per axis, its rates and phases drawn per world and UAV. The manoeuvres are a
+    uniform quintic B-spline (four continuous derivatives) with control points drawn in a box about
+    the drift; both together never leave the room less its margin. The drift may use a third of each
+    limit, the manoeuvres two thirds. Limits strictly bound the vectors' lengths; hours of flight with
+    the defaults reach 3.4 m/s (mean 1.1), 6.2 m/s² and 23 m/s³ in the room of ``indoor-v0``. The yaw
+    wanders with the drift, independent of the velocity, so it is defined at zero speed.
     """
 
     max_speed: float = 4.5  # m/s
@@ -42,23 +43,32 @@ class Aggressive(Motion):
 
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
         positive(self, "max_speed", "max_acceleration", "max_jerk")
-        splines = self._splines(arena)
-        if arena.dim == 3:  # the thrust must point upwards
-            dive = sum(PEAKS[1] * box[2] / spacing**2 for box, spacing in splines)
-            limit = 0.9 * GRAVITY * self.max_acceleration / dive
-            at_most(self, "max_acceleration", self.max_acceleration, limit, arena)
+        (wide, slow), (narrow, fast) = self._boxes(arena)
+        dive = wide[-1] / slow**2 + PEAKS[1] * narrow[-1] / fast**2
+        if arena.dim == 3 and not dive < 0.9 * GRAVITY:
+            raise ValueError(
+                f"Aggressive: max_acceleration = {self.max_acceleration:g} means {dive:.3g} m/s² "
+                f"downwards; the thrust points up: at most {0.9 * GRAVITY:.3g}"
+            )
         own = uav_keys(keys, arena.n_uavs)
-        return {"keys": own, "yaw": 2 * math.pi * uniform(own, "motion.yaw", 1).squeeze(-1)}
+        u = uniform(own, "motion.drift", 2 * (arena.dim + 1) + 1)
+        rate, phase = u[..., : arena.dim + 1], u[..., arena.dim + 1 : -1]
+        return {
+            "keys": own,
+            "rate": (0.5 + 0.5 * rate) / slow,
+            "phase": 2 * math.pi * phase,
+            "yaw": 2 * math.pi * u[..., -1],
+        }
 
     def advance(
         self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
     ) -> tuple[Kinematics, Carry]:
         time = seconds(steps, arena.dt)
-        (wide, slow), (narrow, fast) = self._splines(arena)
-        drift = _spline(carry["keys"], "drift", time, slow, (*wide, math.pi))
-        agile = _spline(carry["keys"], "agile", time, fast, narrow)
+        (wide, _), (narrow, fast) = self._boxes(arena)
+        drift = _sines(carry["rate"], carry["phase"], time, (*wide, math.pi))
+        agile = _spline(carry["keys"], time, fast, narrow)
         position, velocity, acceleration = (
-            a[..., :-1] + b for a, b in zip(drift, agile, strict=True)
+            slow[..., :-1] + quick for slow, quick in zip(drift, agile, strict=True)
         )
         yaw = drift[0][..., -1] + carry["yaw"].unsqueeze(1)
         cosine, sine = yaw.cos(), yaw.sin()
@@ -66,13 +76,14 @@ class Aggressive(Motion):
             attitude = thrust_attitude(acceleration, cosine, sine)
         else:
             attitude = yaw_attitude(cosine, sine, 2)
-        return Kinematics(constant(arena.centre, steps.device) + position, velocity, attitude), carry
+        position = constant(arena.centre, steps.device) + position
+        return Kinematics(position, velocity, attitude), carry
 
-    def _splines(self, arena: Arena) -> tuple[tuple[tuple[float, ...], float], ...]:
-        """Half extents of the control points' box (m) and their spacing (s): slow spline, fast one.
+    def _boxes(self, arena: Arena) -> tuple[tuple[tuple[float, ...], float], ...]:
+        """Half extents (m) and time scale (s) of the drift (1 / fastest rate) and the manoeuvres.
 
-        The fast box is the one in which the limits of speed and of acceleration meet, half as high
-        as wide, and at most half the room.
+        The manoeuvres' box is the one in which their limits of speed and of acceleration meet, half
+        as high as wide, and at most half the room. Their time scale is the knots' spacing.
         """
         halves = half_extents(self, arena, self.margin)
         speed, acceleration = 2 / 3 * self.max_speed / PEAKS[0], 2 / 3 * self.max_acceleration
@@ -80,20 +91,34 @@ class Aggressive(Motion):
         size = speed * speed * PEAKS[1] / acceleration / math.hypot(*shape)
         fast = tuple(min(size * part, 0.5 * half) for part, half in zip(shape, halves, strict=True))
         slow = tuple(half - part for half, part in zip(halves, fast, strict=True))
-        return (slow, self._spacing(slow, 1 / 3)), (fast, self._spacing(fast, 2 / 3))
+        slow_scale = self._scale(slow, (1.0, 1.0, 1.0), 1 / 3)
+        return (slow, slow_scale), (fast, self._scale(fast, PEAKS, 2 / 3))
 
-    def _spacing(self, box: tuple[float, ...], share: float) -> float:
-        """Shortest time between control points (s) that keeps a share of all limits."""
+    def _scale(self, box: tuple[float, ...], peaks: tuple[float, ...], share: float) -> float:
+        """Shortest time scale (s) that keeps a share of all limits."""
         limits = (self.max_speed, self.max_acceleration, self.max_jerk)
         return max(
             (peak * math.hypot(*box) / (share * limit)) ** (1 / order)
-            for order, (peak, limit) in enumerate(zip(PEAKS, limits, strict=True), start=1)
+            for order, (peak, limit) in enumerate(zip(peaks, limits, strict=True), start=1)
         )
+
+
+def _sines(
+    rate: Float64[Tensor, "R N c"],
+    phase: Float64[Tensor, "R N c"],
+    time: Float64[Tensor, "R K 1"],
+    amplitude: tuple[float, ...],
+) -> tuple[Float64[Tensor, "R K N c"], ...]:
+    """Sines and their first two derivatives by time."""
+    rate = rate.unsqueeze(1)
+    angle = rate * time.unsqueeze(-1) + phase.unsqueeze(1)
+    size = constant(amplitude, time.device)
+    position = size * angle.sin()
+    return position, (size * rate) * angle.cos(), -(rate * rate) * position
 
 
 def _spline(
     keys: Int64[Tensor, "R N"],
-    name: str,
     time: Float64[Tensor, "R K 1"],
     spacing: float,
     box: tuple[float, ...],
@@ -101,10 +126,8 @@ def _spline(
     """A random spline within ±box and its first two derivatives by time."""
     knot, u = cycles(time / spacing)
     widths = constant(tuple(2 * half for half in box), time.device)
-    control = [
-        (uniform(fold_each(keys, knot.long() + i), f"motion.{name}", len(box)) - 0.5) * widths
-        for i in range(6)
-    ]
+    drawn = uniform(fold_each(keys, following(knot.long(), 6)), "motion.aggressive", len(box))
+    control = (drawn - 0.5) * widths
     return tuple(_weighted(_weights(u, order, spacing), control) for order in range(3))
 
 
@@ -125,7 +148,7 @@ def _weights(u: Float64[Tensor, "R K 1"], order: int, spacing: float) -> Float64
 
 
 def _weighted(
-    weights: Float64[Tensor, "R K 1 6"], control: list[Float64[Tensor, "R K N c"]]
+    weights: Float64[Tensor, "R K 1 6"], control: Float64[Tensor, "6 R K N c"]
 ) -> Float64[Tensor, "R K N c"]:
     """Sum of the control points by their weights, in a fixed order."""
     total = weights[..., :1] * control[0]

@@ -55,12 +55,13 @@ def circle(
     """Kinematics on a circle about the arena's centre, at an angle (rad) and its rate (rad/s)."""
     cosine, sine = phase.cos(), phase.sin()
     speed = rate * radius
-    position = [arena.centre[0] + radius * cosine, arena.centre[1] + radius * sine]
-    velocity = [-speed * sine, speed * cosine]
-    if arena.dim == 3:
-        position.append(height + height_amplitude * sine)
-        velocity.append(rate * height_amplitude * cosine)
-    return level_flight(position, velocity, (-sine, cosine))
+    position = (
+        arena.centre[0] + radius * cosine,
+        arena.centre[1] + radius * sine,
+        height + height_amplitude * sine,
+    )
+    velocity = (-speed * sine, speed * cosine, rate * height_amplitude * cosine)
+    return level_flight(position, velocity, (-sine, cosine), arena.dim)
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Helix(Motion):
             arena.centre[2] + up * (self.climb * distance - 0.5 * rise),
         )
         velocity = (-self.speed * sine, self.speed * cosine, up * (self.climb * rate))
-        return level_flight(position, velocity, (-sine, cosine)), carry
+        return level_flight(position, velocity, (-sine, cosine), 3), carry
 
     def _radius(self, arena: Arena) -> float:
         return 0.5 * _widest(self, arena) if self.radius is None else self.radius
@@ -138,13 +139,14 @@ class FigureEight(Motion):
         phase = rate * seconds(steps, arena.dt) + carry["phase"].unsqueeze(1)
         cosine, sine = phase.cos(), phase.sin()
         double = 1 - 2 * sine * sine  # cos 2θ: with cos θ the tangent, which never vanishes
-        position = [arena.centre[0] + a * sine, arena.centre[1] + a * sine * cosine]
-        velocity = [rate * a * cosine, rate * a * double]
-        if arena.dim == 3:
-            height = altitude(self, arena, self.height, self.height_amplitude)
-            position.append(height + self.height_amplitude * cosine)
-            velocity.append(-rate * self.height_amplitude * sine)
-        return level_flight(position, velocity, unit(cosine, double)), carry
+        height = altitude(self, arena, self.height, self.height_amplitude)
+        position = (
+            arena.centre[0] + a * sine,
+            arena.centre[1] + a * sine * cosine,
+            height + self.height_amplitude * cosine,
+        )
+        velocity = (rate * a * cosine, rate * a * double, -rate * self.height_amplitude * sine)
+        return level_flight(position, velocity, unit(cosine, double), arena.dim), carry
 
     def _longest(self, arena: Arena) -> float:
         x, y = half_extents(self, arena, self.margin)[:2]

@@ -21,11 +21,16 @@ def uav_keys(keys: Int64[Tensor, "R"], n_uavs: int) -> Int64[Tensor, "R N"]:
     return noise.fold(keys.unsqueeze(-1).expand(-1, n_uavs), uavs.expand(len(keys), -1))
 
 
-def fold_each(keys: Int64[Tensor, "R N"], index: Int64[Tensor, "R K ..."]) -> Int64[Tensor, "..."]:
-    """Keys of numbered draws (steps or control points): R K N, or with more dimensions, R K N M."""
-    keys = keys.view(len(keys), 1, -1, *(1,) * (index.ndim - 3))
-    keys, index = torch.broadcast_tensors(keys, index)
-    return noise.fold(keys, index)
+def fold_each(
+    keys: Int64[Tensor, "R N"], index: Int64[Tensor, "*m R K N"]
+) -> Int64[Tensor, "*m R K N"]:
+    """Keys of numbered draws, a step's or a control point's; ``index`` may be 1 wide over UAVs."""
+    return noise.fold(*torch.broadcast_tensors(keys.unsqueeze(1), index))
+
+
+def following(first: Int64[Tensor, "R K N"], count: int) -> Int64[Tensor, "m R K N"]:
+    """``count`` consecutive numbers from ``first`` on."""
+    return first + torch.arange(count, device=first.device).view(-1, 1, 1, 1)
 
 
 def uniform(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float64[Tensor, "*s n"]:

@@ -11,13 +11,13 @@ def positive(motion: Motion, *settings: str) -> None:
             raise ValueError(f"{_name(motion, setting)} must be positive, not {value!r}")
 
 
-def interval(motion: Motion, setting: str, lowest: float = 0.0) -> tuple[float, float]:
-    """A setting that is a range: (smallest, largest), ordered and above ``lowest``."""
+def interval(motion: Motion, setting: str, zero: bool = False) -> tuple[float, float]:
+    """A setting that is a range (smallest, largest) of positive numbers, or from zero on."""
     small, large = getattr(motion, setting)
-    if not lowest <= small <= large < float("inf"):
+    if not (0 < small <= large < float("inf") or (zero and 0 == small <= large)):
+        allowed = "from 0 on" if zero else "above 0"
         raise ValueError(
-            f"{_name(motion, setting)} must be (smallest, largest) from {lowest:g} on, "
-            f"not {(small, large)!r}"
+            f"{_name(motion, setting)} must be (smallest, largest) {allowed}, not {(small, large)!r}"
         )
     return small, large
 
@@ -47,6 +47,8 @@ def altitude(motion: Motion, arena: Arena, height: float | None, swing: float = 
     """The mean height (m), mid-room if not given; ``swing`` above and below it must fit (3-D)."""
     if arena.dim == 2:
         return 0.0
+    if not swing >= 0:
+        raise ValueError(f"{_name(motion, 'height_amplitude')} = {swing:g} must be at least 0")
     low, high = arena.low[2], arena.high[2]
     at_most(motion, "height_amplitude", swing, 0.5 * (high - low), arena)
     height = arena.centre[2] if height is None else height

@@ -22,8 +22,8 @@ class FormationChange(Motion):
     """A formation on a circle about the arena's centre, heading along it, that changes shape.
 
     Every ``period`` seconds the team blends to the next of ``shapes``, minimum-jerk, during the
-    period's last ``blend`` seconds. All UAVs fly at one height with the formation's heading, and
-    are numbered from its right to its left, so that no two meet in a blend from or to a line or vee.
+    period's last ``blend`` seconds. All UAVs fly at one height with the formation's heading. They
+    are numbered from its right to its left, so no two meet in a blend from or to a line or vee.
     Peak speed ``speed`` (1 + size / radius) + 3.75 size / ``blend``.
     """
 
@@ -67,19 +67,18 @@ class FormationChange(Motion):
         # Along the tangent and the inward normal, and their rates in the turning frame.
         tangential, inward = forward_rate + (self.speed - rate * left), left_rate + rate * forward
         outward = radius - left
-        position = [
+        position = (
             arena.centre[0] + (outward * cosine - forward * sine),
             arena.centre[1] + (outward * sine + forward * cosine),
-        ]
-        velocity = [
+            altitude(self, arena, self.height),
+        )
+        velocity = (
             -tangential * sine - inward * cosine,
             tangential * cosine - inward * sine,
-        ]
-        if arena.dim == 3:
-            position.append(torch.full_like(forward, altitude(self, arena, self.height)))
-            velocity.append(torch.zeros_like(forward))
+            0.0,
+        )
         ahead = (-sine).expand_as(forward), cosine.expand_as(forward)
-        return level_flight(position, velocity, ahead), carry
+        return level_flight(position, velocity, ahead, arena.dim), carry
 
     def _offsets(
         self, time: Float64[Tensor, "R K 1"], size: float, arena: Arena

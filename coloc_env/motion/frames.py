@@ -61,14 +61,17 @@ def level_flight(
     position: Sequence[Tensor | float],
     velocity: Sequence[Tensor | float],
     ahead: tuple[Float64[Tensor, "R K N"], Float64[Tensor, "R K N"]],
+    dim: int,
 ) -> Kinematics:
     """Kinematics from components, level, with the x axis along the unit vector ``ahead``.
 
-    ``ahead`` gives the shape; the components may be smaller tensors or plain numbers.
+    ``ahead`` gives the shape; components may be smaller tensors or plain numbers, and those beyond
+    ``dim`` are left out.
     """
     like = ahead[0]
-    attitude = yaw_attitude(*ahead, len(position))
-    return Kinematics(columns(position, like), columns(velocity, like), attitude)
+    return Kinematics(
+        columns(position[:dim], like), columns(velocity[:dim], like), yaw_attitude(*ahead, dim)
+    )
 
 
 def thrust_attitude(

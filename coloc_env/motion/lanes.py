@@ -13,6 +13,7 @@ from coloc_env.motion.fit import altitude, at_most, half_extents, positive
 from coloc_env.motion.frames import level_flight
 from coloc_env.motion.timing import StopAndGoLaw, alternating, cycles, seconds
 
+_SPEED = 0.5
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 
 
@@ -35,15 +36,16 @@ class Line(Motion):
         positive(self, "speed", "ramp", "pause")
         halves = half_extents(self, arena, self.margin)
         at_most(self, "speed", self.speed, 2 * halves[0] / self.ramp, arena)
-        altitude(self, arena, self.height)
         share = phases(keys, arena.n_uavs, arena.n_uavs)
-        across = arena.centre[1] + halves[1] * (2 * share + 1 / arena.n_uavs - 1)
-        carry = {"legs": 2 * share, "y": across}
-        if arena.dim == 3:
-            mixed = cycles(_GOLDEN * arena.n_uavs * share)[1]
-            spread = arena.centre[2] + halves[2] * (2 * mixed - 1)
-            carry["z"] = spread if self.height is None else torch.full_like(spread, self.height)
-        return carry
+        height, spread = altitude(self, arena, self.height), 0.0
+        if arena.dim == 3 and self.height is None:
+            spread = halves[2]
+        mixed = cycles(_GOLDEN * arena.n_uavs * share)[1]
+        return {
+            "legs": 2 * share,
+            "y": arena.centre[1] + halves[1] * (2 * share + 1 / arena.n_uavs - 1),
+            "z": height + spread * (2 * mixed - 1),
+        }
 
     def advance(
         self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
@@ -55,10 +57,11 @@ class Line(Motion):
         )
         forth = alternating(leg)
         x = arena.centre[0] + forth * (self.speed * distance - 0.5 * length)
-        position = (x, *(carry[axis].unsqueeze(1) for axis in "yz"[: arena.dim - 1]))
-        velocity = (forth * (self.speed * rate), *(0.0, 0.0)[: arena.dim - 1])
+        y, z = carry["y"].unsqueeze(1), carry["z"].unsqueeze(1)
         yaw = math.pi * turned
-        return level_flight(position, velocity, (forth * yaw.cos(), forth * yaw.sin())), carry
+        ahead = forth * yaw.cos(), forth * yaw.sin()
+        velocity = (forth * (self.speed * rate), 0.0, 0.0)
+        return level_flight((x, y, z), velocity, ahead, arena.dim), carry
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class Square(Motion):
 
     side: float | None = None  # m; None: 0.6 of the smaller horizontal side
     corner: tuple[float, float] | None = None  # lower left, m; None: centred
-    period: float = 40.0  # s a round
+    period: float | None = None  # s a round; None: at 0.5 m/s along the sides
     sharp: bool = False
     ramp: float = 1.0  # s from rest to speed, unless sharp
     pause: float = 1.0  # s at rest in each corner, unless sharp
@@ -85,11 +88,11 @@ class Square(Motion):
             if corner[axis] < arena.low[axis]:
                 raise ValueError(f"Square: corner {corner} lies outside the arena, {arena.low}")
         altitude(self, arena, self.height)
-        if not self.sharp and self._law().cruise < 0:
-            needed = 4 * (2 * self.ramp + self.pause)
+        needed = 4 * (2 * self.ramp + self.pause)
+        if not self.sharp and self._period(side) < needed:
             raise ValueError(
-                f"Square: period = {self.period:g} s is too short for ramp = {self.ramp:g} s and "
-                f"pause = {self.pause:g} s: at least {needed:g} s"
+                f"Square: period = {self._period(side):g} s is too short for ramp = {self.ramp:g} "
+                f"s and pause = {self.pause:g} s: at least {needed:g} s"
             )
         return {"sides": 4 * phases(keys, arena.n_uavs, arena.n_uavs)}
 
@@ -97,28 +100,30 @@ class Square(Motion):
         self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
     ) -> tuple[Kinematics, Carry]:
         side, corner = self._place(arena)
-        turns = 4 / self.period * seconds(steps, arena.dt) + carry["sides"].unsqueeze(1)
+        leg_time = 0.25 * self._period(side)
+        turns = seconds(steps, arena.dt) / leg_time + carry["sides"].unsqueeze(1)
         if self.sharp:
             leg, covered = cycles(turns)
-            rate, yaw = 4 / self.period, 0.5 * math.pi * leg
+            rate, turned = torch.full_like(leg, 1 / leg_time), torch.zeros_like(leg)
         else:
-            law = self._law()
+            law = StopAndGoLaw(leg_time - 2 * self.ramp - self.pause, self.ramp, self.pause)
             leg, distance, speed, turned = law.at(turns)
             covered, rate = distance / law.travel, speed / law.travel
-            yaw = 0.5 * math.pi * (leg + turned)
         leg = leg - 4 * (0.25 * leg).floor()
         x, y = _around(leg + covered)
-        position = [corner[0] + side * x, corner[1] + side * y, altitude(self, arena, self.height)]
+        position = (corner[0] + side * x, corner[1] + side * y, altitude(self, arena, self.height))
         pace = side * rate
         east = (leg == 0).double() - (leg == 2).double()
         north = (leg == 1).double() - (leg == 3).double()
-        velocity = [pace * east, pace * north, 0.0]
-        position, velocity = position[: arena.dim], velocity[: arena.dim]
-        return level_flight(position, velocity, (yaw.cos(), yaw.sin())), carry
+        yaw = 0.5 * math.pi * (leg + turned)
+        ahead = yaw.cos(), yaw.sin()
+        return level_flight(position, (pace * east, pace * north, 0.0), ahead, arena.dim), carry
 
-    def _law(self) -> StopAndGoLaw:
-        cruise = 0.25 * self.period - 2 * self.ramp - self.pause
-        return StopAndGoLaw(cruise, self.ramp, self.pause)
+    def _period(self, side: float) -> float:
+        if self.period is not None:
+            return self.period
+        stops = 0.0 if self.sharp else self.ramp + self.pause
+        return 4 * (side / _SPEED + stops)
 
     def _place(self, arena: Arena) -> tuple[float, tuple[float, float]]:
         """Side and lower left corner (m)."""

@@ -40,7 +40,7 @@ class RandomCircles(Motion):
             2 * math.pi * u[5],
         ]
         if arena.dim == 3:
-            swings = interval(self, "height_amplitude")
+            swings = interval(self, "height_amplitude", zero=True)
             at_most(self, "height_amplitude[1]", swings[1], halves[2], arena)
             swing, delay = _between(u[6], swings), 2 * math.pi * u[7]
             drawn.append(arena.centre[2] + (halves[2] - swing) * (2 * u[8] - 1))
@@ -60,7 +60,7 @@ class RandomCircles(Motion):
             z, in_phase, in_quadrature = upright
             position.append(z + (in_phase * sine + in_quadrature * cosine))
             velocity.append(rate * (in_phase * cosine - in_quadrature * sine))
-        return level_flight(position, velocity, (-sense * sine, sense * cosine)), carry
+        return level_flight(position, velocity, (-sense * sine, sense * cosine), arena.dim), carry
 
     def _radius(self, halves: tuple[float, ...], arena: Arena) -> tuple[float, float]:
         widest = min(halves[:2])

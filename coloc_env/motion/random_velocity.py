@@ -21,13 +21,13 @@ class RandomVelocity(Motion):
     """Each UAV's velocity follows a target, speed uniform in [0, v_max], direction uniform.
 
     The target is drawn anew in a step with probability dt / ``interval``; the velocity follows with
-    a first-order lag, integrated exactly. Start positions are uniform in the arena, the first target
-    is the start velocity. The x axis turns towards the horizontal velocity with the same lag, slower
-    at lower speed, so that it stays where it is at rest.
+    a first-order lag, integrated exactly. Start positions are uniform in the arena; the velocity
+    starts on its target. The x axis turns towards the horizontal velocity with the same lag, and
+    slower at lower speed, so that it stays where it is at rest.
 
-    Walls reflect by unfolding: the motion goes on straight through mirror images of the arena and is
-    folded back, which mirrors position, velocity, target and heading at once, however many walls a
-    step meets. The carry is the unfolded state at the next step to be sampled.
+    Walls reflect by unfolding: the motion goes straight on through mirror images of the arena, and
+    is folded back, which mirrors position, velocity, target and heading at once, however many walls
+    a step meets. The carry is the unfolded state at the next step to be sampled.
     """
 
     v_max: float | None = None  # m/s; None: 50, in small rooms half the shortest side per lag

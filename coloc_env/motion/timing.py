@@ -37,7 +37,7 @@ def minimum_jerk(u: Float64[Tensor, "*s"]) -> tuple[Float64[Tensor, "*s"], Float
 
 @dataclass(frozen=True)
 class StopAndGoLaw:
-    """Speed that repeats: up to 1 in ``ramp``, ``cruise``, down in ``ramp``, rest for ``pause`` (s).
+    """Speed that repeats: up to 1 in ``ramp``, ``cruise``, down in ``ramp``, at rest for ``pause``.
 
     The ramps are minimum-jerk, so acceleration is continuous, with peak 1.875 / ramp.
     """

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.motion.draws import constant, fold_each, phases, points, uav_keys
+from coloc_env.motion.draws import constant, fold_each, following, phases, points, uav_keys
 from coloc_env.motion.fit import half_extents, positive
 from coloc_env.motion.frames import heading, unit, yaw_attitude
 from coloc_env.motion.timing import MINIMUM_JERK_SPEED, cycles, minimum_jerk, seconds
@@ -30,7 +30,7 @@ class Waypoints(Motion):
     route: tuple[Point, ...] | None = None  # m
     max_speed: float = 3.0  # m/s, never exceeded
     duration: float | None = None  # s a leg; None: the longest possible leg just reaches max_speed
-    pause: float = 1.0  # s at rest in each waypoint
+    pause: float = 2.0  # s at rest in each waypoint
     margin: float = 0.5  # m that random waypoints keep from the walls
 
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
@@ -77,11 +77,10 @@ class Waypoints(Motion):
         """Start, end, direction and next direction of a leg; waypoint j is drawn from (UAV, j)."""
         low = tuple(a + self.margin for a in arena.low)
         high = tuple(b - self.margin for b in arena.high)
-        index = leg.unsqueeze(-1) + torch.arange(3, device=leg.device)
-        drawn = points(fold_each(keys, index), "motion.waypoints", low, high)
-        leaps = drawn[..., 1:, :] - drawn[..., :2, :]
+        drawn = points(fold_each(keys, following(leg, 3)), "motion.waypoints", low, high)
+        leaps = drawn[1:] - drawn[:2]
         ahead = torch.stack(unit(leaps[..., 0], leaps[..., 1]), -1)
-        return drawn[..., 0, :], drawn[..., 1, :], ahead[..., 0, :], ahead[..., 1, :]
+        return drawn[0], drawn[1], ahead[0], ahead[1]
 
     def _longest(self, arena: Arena) -> float:
         """Length of the longest leg that can come (m)."""

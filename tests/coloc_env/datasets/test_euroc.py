@@ -76,7 +76,7 @@ def test_layout_as_published(tmp_path: Path) -> None:
         ({"imu": "# Time v w\n1248444187.156 \t 0.086 \t -0.398\n"}, "imu0.csv, line 2: 1 columns"),
         ({"imu": IMU.replace("0.5,-3\n14", "0.5,-\n14")}, "line 2: accel_z is '-', not a number"),
         ({"imu": IMU.replace("267142912", "162142912")}, "line 3: the time is before that"),
-        ({"imu": IMU[:-10]}, "line 3: 5 columns, not 7"),
+        ({"imu": IMU[:-10]}, "line 3: 4 columns, not 7"),
         ({"imu": ""}, "imu0.csv: no data"),
     ],
 )

@@ -166,7 +166,12 @@ def test_damaged_cache_is_rebuilt(tmp_path: Path, cache: Path, damage: str) -> N
         with entry.open("wb") as file:
             np.savez(file, version=np.zeros(3))
     else:
-        kinds = {"empty": b"", "cut": content[:300], "garbage": b"x" * 99, "bit": content}
+        kinds = {
+            "empty": bytearray(),
+            "cut": content[:300],
+            "garbage": bytearray(99),
+            "bit": content,
+        }
         entry.write_bytes(kinds[damage])
     np.testing.assert_array_equal(read(path, SECONDS).values, first.values)
     with np.load(entry) as saved:

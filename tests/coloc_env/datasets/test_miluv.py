@@ -136,8 +136,18 @@ TAGS, ANCHORS = "config/uwb/tags.yaml", "config/uwb/anchors.yaml"
         (UWB_1, "range,from_id", "distance,from_id", "line 1: the header does not name one column"),
         (f"{EXPERIMENT}/ifo002/mocap.csv", "0,0,0,1\n", "0,0,0,0\n", "line 2: the quaternion has"),
         (f"{EXPERIMENT}/ifo002/mocap.csv", "0.51", "0.41", "line 3: the time is before"),
-        (f"{EXPERIMENT}/ifo002/imu_px4.csv", "4,5,6", "4,,6", "line 2: linear_acceleration.y is ''"),
-        ("config/experiments.csv", EXPERIMENT, "other", f"no line for the experiment '{EXPERIMENT}'"),
+        (
+            f"{EXPERIMENT}/ifo002/imu_px4.csv",
+            "4,5,6",
+            "4,,6",
+            "line 2: linear_acceleration.y is ''",
+        ),
+        (
+            "config/experiments.csv",
+            EXPERIMENT,
+            "other",
+            f"no line for the experiment '{EXPERIMENT}'",
+        ),
         ("config/experiments.csv", "anchor_constellation", "x", "no entry 'anchor_constellation'"),
         (ANCHORS, '"0b"', '"1"', "anchors.yaml: not a MILUV configuration: no entry '0b'"),
         (ANCHORS, "[3.0, 0.0, 1.0]", "[3.0, 0.0]", "anchors.yaml: not a MILUV configuration"),
@@ -168,7 +178,8 @@ def test_extrinsics_that_are_none(write: Writer, old: str, new: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "file", [*(f"config/{name}" for name in list(CONFIG)[:4]), UWB_1, f"{EXPERIMENT}/ifo001/mag.csv"]
+    "file",
+    [*(f"config/{name}" for name in list(CONFIG)[:4]), UWB_1, f"{EXPERIMENT}/ifo001/mag.csv"],
 )
 def test_missing_file(write: Writer, file: str) -> None:
     with pytest.raises(DataError, match=f"{file}: no such file"):

@@ -1,0 +1,163 @@
+"""A Localizer as a policy of either face: PettingZoo's dictionaries, TorchRL's tensordicts."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from agents.localizer import Localizer
+from coloc_env.observation import Observation, all_leaves, stack
+from coloc_env.scenario import Scenario
+from coloc_env.sensors.base import Layout
+from coloc_env.world import World
+
+CARRIES = ("module", "tensordict")
+
+
+class ParallelPolicy:
+    """A localizer that acts in a PettingZoo parallel environment.
+
+    Call ``reset()`` before every episode, then in each step
+    ``actions = policy({a: observations[a] for a in env.agents})``. ``agents`` names the UAVs that
+    this localizer estimates for (default: all that are there at the first call), so that a team can
+    be a mixture: one policy a kind, their dictionaries merged. A UAV that has failed keeps its row,
+    silent and without measurements, and gets no action.
+    """
+
+    def __init__(self, localizer: Localizer, agents: Sequence[str] | None = None) -> None:
+        self.localizer = localizer
+        self.agents = None if agents is None else tuple(agents)
+        believed = localizer.believed
+        layout = Layout(believed.arena, believed.slots)
+        self._constant = {"prior"}.union(*(s.map_leaves(layout) for s in believed.sensors))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._belief: Any = None
+        self._rows: dict[str, Mapping[str, np.ndarray]] = {}
+
+    @torch.no_grad()
+    def __call__(
+        self, observations: Mapping[str, Mapping[str, np.ndarray]]
+    ) -> dict[str, np.ndarray]:
+        """Actions ``[position (m), velocity (m/s), log-std]`` of the observed agents."""
+        begins = self._belief is None
+        team = (self.agents or tuple(observations)) if begins else tuple(self._rows)
+        present = [agent for agent in team if agent in observations]
+        if begins and len(present) < len(team):
+            missing = next(agent for agent in team if agent not in observations)
+            raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
+        if not present:
+            return {}
+        for agent in team:
+            seen = observations.get(agent)
+            self._rows[agent] = self._silent(self._rows[agent]) if seen is None else seen
+        observation = stack(self._rows.values())
+        if begins:
+            self._belief = self.localizer.reset(observation)
+        self._belief, estimate = self.localizer.step(self._belief, observation)
+        actions = dict(zip(team, estimate.action()[0].numpy(), strict=True))
+        return {agent: actions[agent] for agent in present}
+
+    def _silent(self, row: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What a failed UAV observes: its maps and prior; no measurement, link or message."""
+        return {
+            name: leaf if name in self._constant else np.zeros_like(leaf)
+            for name, leaf in row.items()
+        }
+
+
+class LocalizerPolicy(TensorDictModuleBase):
+    """A localizer as a TorchRL policy: ``("uav", "observation", leaf)`` → ``("uav", "action")``.
+
+    Rows start anew where ``is_init`` says so, which ``InitTracker`` writes. The belief stays in the
+    module, which is then good for one environment at a time, or, with ``carry="tensordict"``, rides
+    in the tensordict under ``belief`` (whose transform is ``make_tensordict_primer()``); then the
+    module has no state. ``Collector(…, auto_register_policy_transforms=True)`` adds both transforms
+    by itself; by hand: ``TransformedEnv(env, InitTracker())``.
+    """
+
+    def __init__(self, localizer: Localizer, scenario: Scenario, carry: str = "module") -> None:
+        if carry not in CARRIES:
+            raise ValueError(f"carry={carry!r} is not allowed: one of {', '.join(CARRIES)}")
+        super().__init__()
+        self.localizer = localizer
+        self.scenario = scenario
+        self.carry = carry
+        self._leaves = tuple(all_leaves(scenario))
+        self._belief: Any = None
+        self.in_keys = [("uav", "observation", name) for name in self._leaves] + ["is_init"]
+        self.out_keys = [("uav", "action")]
+        if carry == "tensordict":
+            self.in_keys.append("belief")
+            self.out_keys.append(("next", "belief"))
+            self._template = self._sample_belief()
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if "is_init" not in tensordict.keys():
+            raise KeyError(
+                "LocalizerPolicy needs 'is_init': wrap the environment in "
+                "TransformedEnv(env, InitTracker())"
+            )
+        seen = tensordict["uav", "observation"]
+        observation = Observation({name: seen[name] for name in self._leaves})
+        belief = self._belief
+        if self.carry == "tensordict":
+            belief = _as(self._template, tensordict["belief"], observation.batch_size)
+        belief = self._start(belief, observation, tensordict["is_init"].flatten())
+        belief, estimate = self.localizer.step(belief, observation)
+        tensordict["uav", "action"] = estimate.action()
+        if self.carry == "tensordict":
+            tensordict["next", "belief"] = belief.to_tensordict()
+        else:
+            self._belief = belief
+        return tensordict
+
+    def _start(self, belief: Any, observation: Observation, rows: Tensor) -> Any:
+        """The belief, with the rows marked at their prior."""
+        if belief is None or belief.batch_size != observation.batch_size or bool(rows.all()):
+            return self.localizer.reset(observation)
+        if not bool(rows.any()):
+            return belief
+        fresh = self.localizer.reset(observation)
+        return fresh.where(rows.unsqueeze(-1).expand(observation.batch_size), belief)
+
+    def _sample_belief(self) -> Any:
+        """A belief of one world, for names, shapes and types."""
+        return self.localizer.reset(World(self.scenario, window=1).reset(0))
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that makes room in tensordicts for what the policy carries there."""
+        carried = self.carry == "tensordict"
+        entries = {"belief": _spec(self._template)} if carried else {}
+        return TensorDictPrimer(entries, expand_specs=True)
+
+
+def _spec(belief: Any) -> Composite:
+    """Specs of a belief's entries without the batch dimension of worlds."""
+    entries: dict[str, Any] = {}
+    for name, value in belief.to_tensordict(retain_none=False).items():
+        if not isinstance(value, Tensor):
+            entries[name] = _spec(value)
+        elif value.dtype == torch.bool:
+            entries[name] = Binary(shape=value.shape[1:], dtype=torch.bool)
+        else:
+            entries[name] = Unbounded(shape=value.shape[1:], dtype=value.dtype)
+    return Composite(entries)
+
+
+def _as(template: Any, entries: TensorDictBase, batch_size: torch.Size) -> Any:
+    """A tensordict's entries as the tensorclass of ``template``, nested ones included."""
+    values = {
+        name: value if isinstance(value, Tensor) else _as(getattr(template, name), value, batch_size)
+        for name, value in entries.items()
+    }
+    return type(template)(**values, batch_size=batch_size)

@@ -1,0 +1,114 @@
+"""Finding sequences in the data folder."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coloc_env import datasets
+from coloc_env.datasets import DataError, Recording, Table, Track, load, sequences
+
+POSE = "0,0,0,1,0,0,0,0,0,0,0,0,0,0,0,0"
+FLIGHT = {"imu0.csv": "#\n1000,0,0,0,0,0,9.8\n", "groundtruth.csv": f"#\n1000,{POSE}\n"}
+DRIVE = {"Barcodes.dat": "1 5\n2 6\n9 7\n", "Landmark_Groundtruth.dat": "9 0 0 0 0\n"}
+
+
+def drive(robots: int) -> dict[str, str]:
+    kinds = {"Groundtruth": "1.5 0 0 0\n", "Odometry": "1.5 0 0\n", "Measurement": "1.5 7 1 0\n"}
+    return DRIVE | {
+        f"Robot{robot}_{kind}.dat": content
+        for robot in range(1, robots + 1)
+        for kind, content in kinds.items()
+    }
+
+
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COLOC_CACHE", str(tmp_path / "cache"))
+    root = tmp_path / "data"
+    monkeypatch.setenv("COLOC_DATA", str(root))
+    contents = {f"euroc/{name}": FLIGHT for name in ("MH_01", "MH_02", "V1_01", "V1_02", "V2_01")}
+    contents |= {"mrclam/a": drive(1), "mrclam/b": drive(2), "mrclam/c": drive(2)}
+    contents |= {"mrclam/other": {"readme.txt": "nothing"}, "miluv": {"readme.txt": "nothing"}}
+    for folder, files in contents.items():
+        (root / folder).mkdir(parents=True)
+        for name, content in files.items():
+            (root / folder / name).write_text(content)
+    return root
+
+
+def test_sequences(data: Path) -> None:
+    assert sequences("mrclam") == ("a", "b", "c")
+    assert sequences("euroc", data) == ("MH_01", "MH_02", "V1_01", "V1_02", "V2_01")
+    assert sequences("miluv") == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "sequence", "loaded"),
+    [
+        ("mrclam", None, "mrclam/b"),
+        ("mrclam", "c", "mrclam/c"),
+        ("euroc", None, "euroc/MH_01+MH_02"),
+        ("euroc", "V1_02", "euroc/V1_02"),
+        ("euroc", "V1_02,V1_01", "euroc/V1_02+V1_01"),
+    ],
+)
+def test_which_is_loaded(data: Path, name: str, sequence: str | None, loaded: str) -> None:
+    assert load(name, sequence).name == loaded
+    assert load(name, sequence, data).name == loaded
+
+
+@pytest.mark.parametrize(
+    ("name", "sequence", "reason"),
+    [
+        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv"),
+        ("mrclam", "d", "no sequence 'd' in .*mrclam, there are: a, b, c"),
+        ("mrclam", "a,b", "one sequence at a time, not a,b"),
+        ("euroc", "V1_01,V9", "no sequence 'V9'"),
+        ("euroc", "V1_01,V2_01", "different sequences of one room"),
+        ("miluv", None, "no sequence of miluv in"),
+        ("miluv", "x", "no sequence 'x' in .*miluv, there are: none"),
+    ],
+)
+def test_what_is_not_there(data: Path, name: str, sequence: str | None, reason: str) -> None:
+    with pytest.raises(DataError, match=reason):
+        load(name, sequence)
+
+
+def test_no_data(data: Path) -> None:
+    for name in datasets.DATASETS:
+        with pytest.raises(DataError, match=f"away: set COLOC_DATA or --data .*{name}/ \\(from"):
+            load(name, data=data / "away")
+    (data / "miluv" / "readme.txt").unlink()
+    (data / "miluv").rmdir()
+    with pytest.raises(DataError, match=r"no recordings in .*miluv: set COLOC_DATA or --data"):
+        load("miluv")
+
+
+def test_unknown_option(data: Path) -> None:
+    with pytest.raises(TypeError, match="imu"):
+        load("mrclam", imu="px4")
+
+
+def test_recordings_that_contradict_themselves() -> None:
+    time = np.array([0, 1])
+    with pytest.raises(ValueError, match="does not increase"):
+        Track(np.array([1, 1]), np.zeros((2, 2)), np.zeros((2, 1)))
+    with pytest.raises(ValueError, match=r"Track\.attitude has shape \(2, 1\), not \(2, 4\)"):
+        Track(time, np.zeros((2, 3)), np.zeros((2, 1)))
+    with pytest.raises(ValueError, match="does not increase"):
+        Table(time[::-1].copy(), np.zeros((2, 1)), ("height",))
+    with pytest.raises(ValueError, match="not int64"):
+        Table(time * 1.0, np.zeros((2, 1)), ("height",))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="columns"):
+        Table(time, np.zeros((2, 2)), ("height",))
+    track = Track(time, np.zeros((2, 2)), np.zeros((2, 1)))
+    points = np.zeros((0, 2))
+    with pytest.raises(ValueError, match="holds 1 robots, not 2"):
+        Recording("x", 2, ("a", "b"), (track,), {}, points, points, np.zeros((2, 0, 2)), "")
+    with pytest.raises(ValueError, match="tags"):
+        Recording("x", 2, ("a",), (track,), {}, points, points, np.zeros((2, 0, 2)), "")
+    with pytest.raises(ValueError, match="anchors"):
+        Recording("x", 2, ("a",), (track,), {}, points, np.zeros((0, 3)), np.zeros((1, 0, 2)), "")
+    with pytest.raises(ValueError, match="not in 3 dimensions"):
+        Recording("x", 3, ("a",), (track,), {}, points, points, np.zeros((1, 0, 3)), "")
