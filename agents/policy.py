@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
@@ -102,7 +102,8 @@ class LocalizerPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if "is_init" not in tensordict.keys():
+        begins = tensordict.get("is_init", None)
+        if begins is None:
             raise KeyError(
                 "LocalizerPolicy needs 'is_init': wrap the environment in "
                 "TransformedEnv(env, InitTracker())"
@@ -111,12 +112,12 @@ class LocalizerPolicy(TensorDictModuleBase):
         observation = Observation({name: seen[name] for name in self._leaves})
         belief = self._belief
         if self.carry == "tensordict":
-            belief = _as(self._template, tensordict["belief"], observation.batch_size)
-        belief = self._start(belief, observation, tensordict["is_init"].flatten())
+            belief = _restored(self._template, tensordict["belief"], observation.batch_size)
+        belief = self._start(belief, observation, begins.flatten())
         belief, estimate = self.localizer.step(belief, observation)
         tensordict["uav", "action"] = estimate.action()
         if self.carry == "tensordict":
-            tensordict["next", "belief"] = belief.to_tensordict()
+            tensordict["next", "belief"] = _flat(belief)
         else:
             self._belief = belief
         return tensordict
@@ -137,27 +138,35 @@ class LocalizerPolicy(TensorDictModuleBase):
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that makes room in tensordicts for what the policy carries there."""
         carried = self.carry == "tensordict"
-        entries = {"belief": _spec(self._template)} if carried else {}
+        entries = {"belief": _spec(_flat(self._template))} if carried else {}
         return TensorDictPrimer(entries, expand_specs=True)
 
 
-def _spec(belief: Any) -> Composite:
-    """Specs of a belief's entries without the batch dimension of worlds."""
-    entries: dict[str, Any] = {}
-    for name, value in belief.to_tensordict(retain_none=False).items():
-        if not isinstance(value, Tensor):
-            entries[name] = _spec(value)
-        elif value.dtype == torch.bool:
-            entries[name] = Binary(shape=value.shape[1:], dtype=torch.bool)
-        else:
-            entries[name] = Unbounded(shape=value.shape[1:], dtype=value.dtype)
-    return Composite(entries)
+def _flat(belief: Any) -> TensorDict:
+    """A belief's entries, nested names joined by dots, with a batch size of worlds alone (so that
+    the primer's zeros and the policy's beliefs have one shape)."""
+    entries = belief.to_tensordict(retain_none=False).flatten_keys(".")
+    return TensorDict(dict(entries.items()), batch_size=belief.batch_size[:1])
 
 
-def _as(template: Any, entries: TensorDictBase, batch_size: torch.Size) -> Any:
-    """A tensordict's entries as the tensorclass of ``template``, nested ones included."""
+def _restored(template: Any, entries: TensorDictBase, batch_size: torch.Size) -> Any:
+    """Entries of ``_flat`` as the tensorclass of ``template``, nested ones included."""
     values = {
-        name: value if isinstance(value, Tensor) else _as(getattr(template, name), value, batch_size)
-        for name, value in entries.items()
+        name: value
+        if isinstance(value, Tensor)
+        else _restored(getattr(template, name), value, batch_size)
+        for name, value in entries.unflatten_keys(".").items()
     }
     return type(template)(**values, batch_size=batch_size)
+
+
+def _spec(flat: TensorDict) -> Composite:
+    """Specs of a belief's entries without the dimension of worlds."""
+    return Composite(
+        {
+            name: Binary(shape=value.shape[1:], dtype=torch.bool)
+            if value.dtype == torch.bool
+            else Unbounded(shape=value.shape[1:], dtype=value.dtype)
+            for name, value in flat.items()
+        }
+    )

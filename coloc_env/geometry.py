@@ -53,17 +53,17 @@ def quaternion_exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
 
 def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
     """Unit quaternion to the rotation vector of angle at most π; differentiable at identity."""
-    q = torch.where(q[..., :1] < 0, -q, q)
-    real, imaginary = q[..., :1], q[..., 1:]
-    squared = (imaginary * imaginary).sum(-1, keepdim=True)
+    w, x, y, z = q.unbind(-1)
+    real = w.abs()
+    squared = x * x + y * y + z * z
     small = squared < _SMALL
-    sine = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    ratio = squared / (real * real)
+    sine = torch.where(small, 1.0, squared).sqrt()
     scale = torch.where(
-        small,
-        2 / real * (1 - squared / (3 * real * real) + squared**2 / (5 * real**4)),
-        4 * torch.atan(sine / (1 + real)) / sine,
+        small, 2 / real * (1 - ratio / 3 + ratio * ratio / 5), 4 * torch.atan(sine / (1 + real)) / sine
     )
-    return scale * imaginary
+    scale = torch.where(w < 0, -scale, scale)
+    return torch.stack((scale * x, scale * y, scale * z), -1)
 
 
 def quaternion_matrix(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3 3"]:

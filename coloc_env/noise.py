@@ -46,6 +46,8 @@ def _mix_(z: Int64[Tensor, "*s"], shifted: Int64[Tensor, "*s"]) -> Int64[Tensor,
 
 def fold(key: Int64[Tensor, "*s"], data: Int64[Tensor, "*s"] | int) -> Int64[Tensor, "*s"]:
     """A new key from ``key`` and an integer (a step, a pair's index, a row's seed)."""
+    if isinstance(data, int):
+        data = torch.tensor(data, device=key.device)
     return mix(key + (data + 1) * _GOLDEN)
 
 
@@ -70,13 +72,13 @@ def _random(
     """``count`` numbers per key: ``write`` turns random 32-bit integers into floats, in place."""
     words = (count + 1) // 2
     counters, flat = _counters(stream, words, keys.device), keys.reshape(-1, 1)
-    out = torch.empty(len(flat), 2 * words, device=keys.device)
+    out = torch.empty(len(flat), count, device=keys.device)
     rows = max(1, _CHUNK // words) if keys.device.type == "cpu" else max(1, len(flat))
     for start in range(0, len(flat), rows):
         bits = flat[start : start + rows] ^ counters
         _mix_(bits, torch.empty_like(bits))
-        write(bits.view(torch.int32), out[start : start + rows])
-    return out[:, :count].view(*keys.shape, count)
+        write(bits.view(torch.int32)[:, :count], out[start : start + rows])
+    return out.view(*keys.shape, count)
 
 
 def _write_uniform(bits: Int32[Tensor, "r n"], out: Float32[Tensor, "r n"]) -> None:

@@ -1,7 +1,9 @@
 """Sensing a window: truth, network and every sensor, for some rows over some steps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -14,72 +16,98 @@ from coloc_env.scenario import Prior, Scenario
 from coloc_env.sensors.base import Window
 
 
+class _Rows:
+    """Base of dataclasses of tensors (or dicts of them) whose first dimension counts worlds."""
+
+    def map(self, f: Callable[..., Tensor], *others: Self) -> Self:
+        """``f`` applied to every tensor, and to the same one of the ``others``."""
+        every = [[getattr(x, field.name) for x in (self, *others)] for field in fields(self)]  # type: ignore[arg-type]
+        return type(self)(*(_apply(f, *values) for values in every))
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """Blocks of worlds as one."""
+        return parts[0].map(lambda *tensors: torch.cat(tensors), *parts[1:])
+
+
+def _apply(f: Callable[..., Tensor], first: Any, *others: Any) -> Any:
+    if isinstance(first, dict):
+        return {name: f(value, *(other[name] for other in others)) for name, value in first.items()}
+    return f(first, *others)
+
+
 @dataclass(frozen=True)
-class Past:
+class Past(_Rows):
     """Kinematics [R, H, N, …] of the last steps before a window: for increments and delays."""
 
-    position: Tensor
-    velocity: Tensor
-    attitude: Tensor
+    position: Float64[Tensor, "R H N d"]
+    velocity: Float64[Tensor, "R H N d"]
+    attitude: Float64[Tensor, "R H N a"]
 
-    def map(self, f: Callable[[Tensor, Tensor], Tensor], other: "Past") -> "Past":
-        return Past(
-            f(self.position, other.position),
-            f(self.velocity, other.velocity),
-            f(self.attitude, other.attitude),
-        )
 
-    @staticmethod
-    def cat(parts: Sequence["Past"]) -> "Past":
-        return Past(
-            torch.cat([p.position for p in parts]),
-            torch.cat([p.velocity for p in parts]),
-            torch.cat([p.attitude for p in parts]),
-        )
+class Frame(NamedTuple):
+    """One step of a window; ``failed`` marks UAVs that fail at this very step."""
+
+    position: Float64[Tensor, "R N d"]
+    velocity: Float64[Tensor, "R N d"]
+    attitude: Float64[Tensor, "R N a"]
+    steps: Int64[Tensor, "R"]
+    over: Bool[Tensor, "R"]
+    alive: Bool[Tensor, "R N"]
+    failed: Bool[Tensor, "R N"]
+    scored: Bool[Tensor, "R N"]
 
 
 @dataclass(frozen=True)
-class Sensed:
-    """A window of truth (float64) and leaves (float32): [R, K, N, …] each."""
+class Sensed(_Rows):
+    """A window of truth (float64) and leaves (float32): [R, K, N, …] each.
+
+    ``steps`` counts each row's own, ``over`` is true from the horizon on, ``failed`` in the step in
+    which a UAV fails.
+    """
 
     position: Float64[Tensor, "R K N d"]
     velocity: Float64[Tensor, "R K N d"]
     attitude: Float64[Tensor, "R K N a"]
+    steps: Int64[Tensor, "R K"]
+    over: Bool[Tensor, "R K"]
     alive: Bool[Tensor, "R K N"]
+    failed: Bool[Tensor, "R K N"]
     scored: Bool[Tensor, "R K N"]
     leaves: dict[str, Float32[Tensor, "R K N F"]]
 
     @property
     def count(self) -> int:
         """Steps in the window."""
-        return self.position.shape[1]
+        return self.steps.shape[1]
 
-    def neighbours(self, step: int) -> Int64[Tensor, "R N S"] | None:
-        """UAV index of each slot; None where slot j is UAV j."""
-        if "neighbours" not in self.leaves:
-            return None
-        return self.leaves["neighbours"][:, step].to(torch.int64)
+    @cached_property
+    def frames(self) -> list[Frame]:
+        """The window's steps one by one (views, cut in one go: far cheaper than one at a time)."""
+        parts = (getattr(self, name).unbind(1) for name in Frame._fields)
+        return [Frame(*views) for views in zip(*parts, strict=True)]
 
-    def map(self, f: Callable[[Tensor, Tensor], Tensor], other: "Sensed") -> "Sensed":
-        return Sensed(
-            f(self.position, other.position),
-            f(self.velocity, other.velocity),
-            f(self.attitude, other.attitude),
-            f(self.alive, other.alive),
-            f(self.scored, other.scored),
-            {name: f(leaf, other.leaves[name]) for name, leaf in self.leaves.items()},
-        )
+    @cached_property
+    def leaf_frames(self) -> list[dict[str, Float32[Tensor, "R N F"]]]:
+        """The leaves of the window's steps one by one."""
+        parts = (leaf.unbind(1) for leaf in self.leaves.values())
+        return [dict(zip(self.leaves, views, strict=True)) for views in zip(*parts, strict=True)]
 
-    @staticmethod
-    def cat(parts: Sequence["Sensed"]) -> "Sensed":
-        return Sensed(
-            torch.cat([p.position for p in parts]),
-            torch.cat([p.velocity for p in parts]),
-            torch.cat([p.attitude for p in parts]),
-            torch.cat([p.alive for p in parts]),
-            torch.cat([p.scored for p in parts]),
-            {name: torch.cat([p.leaves[name] for p in parts]) for name in parts[0].leaves},
-        )
+    @cached_property
+    def states(self) -> tuple[Float32[Tensor, "R S"], ...]:
+        """Each step's truth, flat: per UAV position, velocity, attitude, alive, scored."""
+        flags = torch.stack((self.alive, self.scored), -1)
+        parts = (self.position, self.velocity, self.attitude, flags)
+        return torch.cat([p.to(torch.float32) for p in parts], -1).flatten(2).unbind(1)
+
+    @cached_property
+    def all_scored(self) -> bool:
+        """Whether every estimate of the window counts."""
+        return bool(self.scored.all())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The tensors alone: views are cut anew after a copy."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def sense(
@@ -98,24 +126,22 @@ def sense(
     """
     arena, network = scenario.arena, scenario.network
     steps = first.unsqueeze(-1) + torch.arange(count, device=keys.device)
-    motion, carry = scenario.motion.advance(carry, steps, arena)
+    moved, carry = scenario.motion.advance(carry, steps, arena)
     delays = {sensor.delay for sensor in scenario.sensors} - {0}
     lead = max({1} | delays)
+    now = Past(moved.position, moved.velocity, moved.attitude)
     if past is None:
-        now = Past(motion.position[:, :1], motion.velocity[:, :1], motion.attitude[:, :1])
-        past = now.map(lambda x, _: x.expand(-1, lead, *x.shape[2:]), now)
-    whole = past.map(
-        lambda x, y: torch.cat((x, y), 1), Past(motion.position, motion.velocity, motion.attitude)
-    )
+        past = now.map(lambda x: x[:, :1].expand(-1, lead, *x.shape[2:]))
+    whole = past.map(_join, now)
 
     def back(by: int) -> Kinematics:
-        part = slice(lead - by, lead - by + count)
-        return Kinematics(
-            whole.position[:, part], whole.velocity[:, part], whole.attitude[:, part]
-        )
+        part = whole.map(lambda x: x[:, lead - by : lead - by + count])
+        return Kinematics(part.position, part.velocity, part.attitude)
 
+    motion = back(0)
     step_keys = noise.fold(keys.unsqueeze(-1), steps)
-    alive = steps.unsqueeze(-1) < fails_at.unsqueeze(1)
+    fails_at = fails_at.unsqueeze(1)
+    alive = steps.unsqueeze(-1) < fails_at
     neighbours, reach = network.neighbours(motion.position, alive)
     window = Window(
         layout=scenario.layout,
@@ -137,9 +163,23 @@ def sense(
     leaves["links"] = network.links(step_keys, neighbours, reach).to(torch.float32)
     if not network.dense(arena.n_uavs):
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
-    scored = alive if motion.valid is None else alive & motion.valid
-    sensed = Sensed(motion.position, motion.velocity, motion.attitude, alive, scored, leaves)
-    return sensed, carry, whole.map(lambda x, _: x[:, -lead:], whole)
+    sensed = Sensed(
+        motion.position,
+        motion.velocity,
+        motion.attitude,
+        steps,
+        steps >= scenario.horizon,
+        alive,
+        steps.unsqueeze(-1) == fails_at,
+        alive if moved.valid is None else alive & moved.valid,
+        leaves,
+    )
+    return sensed, carry, whole.map(lambda x: x[:, -lead:])
+
+
+def _join(before: Tensor, now: Tensor) -> Tensor:
+    """Steps one after the other, each component contiguous in memory: what sensors compute with."""
+    return torch.cat((before.movedim(-1, 0), now.movedim(-1, 0)), 2).movedim(0, -1)
 
 
 def draw_prior(

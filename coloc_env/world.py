@@ -21,9 +21,10 @@ from coloc_env.observation import (
 )
 from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
-from coloc_env.sense import Past, Sensed, draw_prior, sense
+from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
 
 _AGENT_STEPS = 6144  # (row, step, UAV) items sensed at once: what stays in cache
+_LONGEST = 256  # steps sensed ahead at most: what comes of a shorter episode is thrown away
 
 
 @dataclass(frozen=True)
@@ -55,23 +56,21 @@ class World:
         device: str | torch.device = "cpu",
         window: int | None = None,
     ) -> None:
-        if batch_size < 1:
-            raise ValueError(f"World: batch_size={batch_size} is not allowed: at least 1")
+        for name, value in (("batch_size", batch_size), ("window", window)):
+            if value is not None and value < 1:
+                raise ValueError(f"World: {name}={value} is not allowed: at least 1")
         self.scenario = scenario
         self.batch_size = batch_size
         self.device = torch.device(device)
         ahead = _AGENT_STEPS // (batch_size * scenario.arena.n_uavs)
-        self.window = window or max(1, min(ahead, 128))
+        self.window = window or max(1, min(ahead, _LONGEST, scenario.horizon + 1))
         self._rows = max(1, _AGENT_STEPS // (self.window * scenario.arena.n_uavs))
         if self.device.type != "cpu":
             self._rows = batch_size
         self._delay = scenario.network.delay
+        self._width = action_width(scenario)
         self._static_names = tuple(static_leaves(scenario))
         self.cursor = -1
-        self._can_fail = bool(scenario.failure_rate or scenario.failures)
-        self._none_failed = torch.zeros(
-            batch_size, scenario.arena.n_uavs, dtype=torch.bool, device=self.device
-        )
         self._sent: deque[Tensor] = deque(maxlen=self._delay + 1)
 
     # ---------------------------------------------------------------- reset
@@ -91,12 +90,10 @@ class World:
         if seeds.shape != (b,):
             raise ValueError(f"World: {b} seeds are needed, one a row, got {tuple(seeds.shape)}")
         if rows is None or self.cursor < 0 or bool(rows.all()):
-            self.seeds = seeds
-            self.step_index = torch.zeros(b, dtype=torch.int64, device=self.device)
+            self.seeds = seeds.clone()
             self._sent.clear()
-            self.cursor = 0
             self._place(seeds)
-            self._sense(self.window, None)
+            self._sense(torch.zeros_like(seeds), None)
         else:
             self._reset_rows(seeds, rows.nonzero()[:, 0])
         self._since_reset = 0
@@ -130,19 +127,21 @@ class World:
 
     def _reset_rows(self, seeds: Int64[Tensor, "B"], rows: Int64[Tensor, "r"]) -> None:
         """Reset some rows in the middle of a window, into fresh memory."""
-        fresh = World(self.scenario, len(rows), self.device, self.window - self.cursor)
+        if not len(rows):
+            return
+        start = self.cursor
+        fresh = World(self.scenario, len(rows), self.device, self.window - start)
         fresh.reset(seeds[rows])
 
-        def merge(old: Tensor, new: Tensor, start: int | None = None) -> Tensor:
+        def merge(old: Tensor, new: Tensor) -> Tensor:
+            return old.index_put((rows,), new)
+
+        def merge_window(old: Tensor, new: Tensor) -> Tensor:
             old = old.clone()
-            if start is None:
-                old[rows] = new
-            else:
-                old[rows, start:] = new
+            old[rows, start:] = new
             return old
 
         self.seeds = merge(self.seeds, fresh.seeds)
-        self.step_index = merge(self.step_index, fresh.step_index)
         self._keys = merge(self._keys, fresh._keys)
         self._fails_at = merge(self._fails_at, fresh._fails_at)
         self._carry = {k: merge(v, fresh._carry[k]) for k, v in self._carry.items()}
@@ -152,12 +151,12 @@ class World:
             for old, new in zip(self._placed, fresh._placed, strict=True)
         ]
         self._past = self._past.map(merge, fresh._past)
-        self.sensed = self.sensed.map(lambda old, new: merge(old, new, self.cursor), fresh.sensed)
+        self.sensed = self.sensed.map(merge_window, fresh.sensed)
 
     # ---------------------------------------------------------------- sense
 
-    def _sense(self, count: int, past: Past | None) -> None:
-        """Sense ``count`` steps from the rows' current ones on, in blocks that stay in cache."""
+    def _sense(self, first: Int64[Tensor, "B"], past: Past | None) -> None:
+        """Sense a window from each row's ``first`` step on, in blocks that stay in cache."""
         blocks = []
         for start in range(0, self.batch_size, self._rows):
             part = slice(start, start + self._rows)
@@ -165,24 +164,24 @@ class World:
                 sense(
                     self.scenario,
                     keys=self._keys[part],
-                    first=self.step_index[part],
-                    count=count,
+                    first=first[part],
+                    count=self.window,
                     carry={k: v[part] for k, v in self._carry.items()},
                     placed=[{k: v[part] for k, v in p.items()} for p in self._placed],
                     fails_at=self._fails_at[part],
-                    past=past.map(lambda x, _: x[part], past) if past else None,
+                    past=past.map(lambda x, part=part: x[part]) if past else None,
                 )
             )
+        sensed, carries, pasts = zip(*blocks, strict=True)
         if len(blocks) == 1:
             self.sensed, self._carry, self._past = blocks[0]
         else:
-            sensed, carries, pasts = zip(*blocks, strict=True)
-            self.sensed = Sensed.cat(sensed)
+            self.sensed, self._past = Sensed.cat(sensed), Past.cat(pasts)
             self._carry = {k: torch.cat([c[k] for c in carries]) for k in carries[0]}
-            self._past = Past.cat(pasts)
+        self.cursor = 0
         if past is None:
-            truth = self.truth
-            self._static["prior"] = draw_prior(self.scenario.prior, self._keys, truth, self.scenario)
+            prior = draw_prior(self.scenario.prior, self._keys, self.truth, self.scenario)
+            self._static["prior"] = prior
 
     # ---------------------------------------------------------------- step
 
@@ -192,50 +191,50 @@ class World:
         The next step's measurements are ``observation()``.
         """
         error, scored = self.score(estimates)
-        position = self.sensed.position[:, self.cursor]
+        position = self.now.position
         value = reward(self.scenario.reward, estimates, position, error, scored)
-        alive = self.alive
         self.advance(estimates)
-        return Step(
-            reward=value,
-            error=error,
-            scored=scored,
-            terminated=alive & ~self.alive if self._can_fail else self._none_failed,
-            truncated=self.step_index >= self.scenario.horizon,
-        )
+        now = self.now
+        return Step(value, error, scored, terminated=now.failed, truncated=now.over)
 
     def score(
         self, estimates: Float32[Tensor, "B N A"]
     ) -> tuple[Float32[Tensor, "B N"], Bool[Tensor, "B N"]]:
         """Position error in m at the current step, and where it counts."""
-        dim = self.scenario.arena.dim
-        difference = estimates[..., :dim] - self.sensed.position[:, self.cursor]
-        scored = self.sensed.scored[:, self.cursor]
-        error = torch.linalg.vector_norm(difference, dim=-1).to(torch.float32) * scored
-        return error, scored
+        now, dim = self.now, self.scenario.arena.dim
+        difference = estimates[..., :dim] - now.position
+        error = torch.linalg.vector_norm(difference, dim=-1).to(torch.float32)
+        return error if self.sensed.all_scored else error * now.scored, now.scored
 
     def advance(self, estimates: Float32[Tensor, "B N A"]) -> None:
         """Send the estimates as messages and move to the next step."""
         self._sent.append(estimates)
-        self.step_index = self.step_index + 1
         self.cursor += 1
         self._since_reset += 1
         if self.cursor == self.sensed.count:
-            self.cursor = 0
-            self._sense(self.window, self._past)
+            self._sense(self.sensed.steps[:, -1] + 1, self._past)
 
     # ---------------------------------------------------------------- views
 
     @property
+    def now(self) -> Frame:
+        """Truth, progress and who counts at the current step."""
+        return self.sensed.frames[self.cursor]
+
+    @property
     def truth(self) -> Kinematics:
         """True kinematics [B, N, …] at the current step (float64); privileged."""
-        s, i = self.sensed, self.cursor
-        return Kinematics(s.position[:, i], s.velocity[:, i], s.attitude[:, i])
+        return Kinematics(*self.now[:3])
 
     @property
     def alive(self) -> Bool[Tensor, "B N"]:
         """UAVs that have not failed."""
-        return self.sensed.alive[:, self.cursor]
+        return self.now.alive
+
+    @property
+    def step_index(self) -> Int64[Tensor, "B"]:
+        """The step each row is at: 0 after its reset."""
+        return self.now.steps
 
     @property
     def static(self) -> dict[str, Float32[Tensor, "B N F"]]:
@@ -244,37 +243,40 @@ class World:
 
     def state(self) -> Float32[Tensor, "B S"]:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""
-        s, i = self.sensed, self.cursor
-        flags = torch.stack((s.alive[:, i], s.scored[:, i]), -1)
-        parts = (s.position[:, i], s.velocity[:, i], s.attitude[:, i], flags)
-        return torch.cat([p.to(torch.float32) for p in parts], -1).flatten(1)
+        return self.sensed.states[self.cursor]
 
     def messages(self) -> tuple[Float32[Tensor, "B N F"], Float32[Tensor, "B N S"]]:
         """Delivered messages and their mask: what senders' actions said 1 + delay steps ago."""
-        links = self.sensed.leaves["links"][:, self.cursor]
-        width = action_width(self.scenario)
+        leaves = self.sensed.leaf_frames[self.cursor]
+        mask = leaves["links"]
         if len(self._sent) <= self._delay:
-            b, n, s = links.shape
-            return links.new_zeros(b, n, s * width), torch.zeros_like(links)
-        sent, mask = self._sent[0], links
+            b, n, s = mask.shape
+            return mask.new_zeros(b, n, s * self._width), torch.zeros_like(mask)
         if self._since_reset <= self._delay:
-            mask = links * (self.step_index > self._delay)[:, None, None]
-        neighbours = self.sensed.neighbours(self.cursor)
-        if neighbours is None:
-            content = sent.unsqueeze(1)
-        else:
-            content = sent[torch.arange(len(sent), device=sent.device)[:, None, None], neighbours]
-        return (content * mask.unsqueeze(-1)).flatten(-2), mask
+            mask = mask * (self.step_index > self._delay)[:, None, None]
+        content = self._sent[0].unsqueeze(1)
+        if "neighbours" in leaves:
+            senders = leaves["neighbours"].to(torch.int64)
+            rows = torch.arange(len(senders), device=self.device)[:, None, None]
+            content = self._sent[0][rows, senders]
+        # Filled, not multiplied: a diverged sender's NaN reaches only those who hear it.
+        return content.masked_fill((mask == 0).unsqueeze(-1), 0.0).flatten(-2), mask.clone()
 
     def observation(self) -> Observation:
         """What every UAV observes at the current step."""
-        leaves = {name: leaf[:, self.cursor] for name, leaf in self.sensed.leaves.items()}
-        leaves["messages"], leaves["message_mask"] = self.messages()
-        return Observation(leaves | self.static)
+        messages, mask = self.messages()
+        return Observation(
+            {
+                **self.sensed.leaf_frames[self.cursor],
+                "messages": messages,
+                "message_mask": mask,
+                **self.static,
+            }
+        )
 
     def check(self, estimates: Tensor) -> None:
         """Raise a ValueError for estimates of a wrong shape or with values that are not finite."""
-        shape = (self.batch_size, self.scenario.arena.n_uavs, action_width(self.scenario))
+        shape = (self.batch_size, self.scenario.arena.n_uavs, self._width)
         if tuple(estimates.shape) != shape:
             raise ValueError(
                 f"{self.scenario.name}: actions of shape {tuple(estimates.shape)} do not fit: "

@@ -52,7 +52,8 @@ def heard(believed: Believed, observation: Observation) -> Neighbours:
 class Block:
     """m measurements of k numbers each, linearized at some state: residual z − h(x).
 
-    ``jacobian`` is ∂h/∂δ of the UAV's own error, ``variance`` the measurement's own noise (diagonal).
+    ``jacobian`` is ∂h/∂δ of the UAV's own error (empty where derivatives were not asked for),
+    ``variance`` the measurement's own noise (diagonal).
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
     position and ``partner_variance`` what its uncertainty adds; they come as (…, slot, ``per_slot``)
     flattened, and ``mutual`` says that both UAVs hold the very same number.
@@ -87,8 +88,13 @@ class Measurement(ABC):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
-        """Residuals and Jacobians at ``x``."""
+        """Residuals and, unless ``derivatives`` are not wanted, Jacobians at ``x``.
+
+        Leading dimensions are free: for particles x is [B, N, M, S] and the leaves of the
+        observation and of ``neighbours`` have a dimension 1 in place of M.
+        """
 
 
 class LandmarkVectors(Measurement):
@@ -103,24 +109,28 @@ class LandmarkVectors(Measurement):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
         d = process.dim
         rotation, turn = process.rotation(x), process.attitude_error
         if rotation is None or turn is None:
             raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
-        z = observation["landmarks"].double().unflatten(-1, (-1, d))
-        apart = observation["landmark_map"].double().unflatten(-1, (-1, d)) - x[..., None, :d]
+        z = observation["landmarks"].to(x.dtype).unflatten(-1, (-1, d))
+        apart = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)) - x[..., None, :d]
         expected = apart @ rotation
-        jacobian = x.new_zeros(*z.shape, process.error_size)
-        jacobian[..., :d] = -rotation.mT.unsqueeze(-3)
-        if d == 3:
-            jacobian[..., turn] = cross_matrix(expected)
-        else:
-            jacobian[..., turn] = torch.stack((expected[..., 1:], -expected[..., :1]), -2)
+        residual = z - expected
+        jacobian = x.new_zeros(0)
+        if derivatives:
+            jacobian = x.new_zeros(*residual.shape, process.error_size)
+            jacobian[..., :d] = -rotation.mT.unsqueeze(-3)
+            if d == 3:
+                jacobian[..., turn] = cross_matrix(expected)
+            else:
+                jacobian[..., turn] = torch.stack((expected[..., 1:], -expected[..., :1]), -2)
         return Block(
-            residual=z - expected,
+            residual=residual,
             jacobian=jacobian,
-            variance=torch.full_like(z, self.std**2),
+            variance=x.new_tensor(self.std**2).expand_as(residual),
             mask=observation["landmark_mask"] > 0,
         )
 
@@ -132,6 +142,11 @@ class _Ranges(Measurement):
         self.variance = std**2
         self.tags = tags
 
+    def _arms(self, x: Float[Tensor, "B N S"]) -> Float[Tensor, "B N T d"]:
+        """Lever arms [N, T, d], with a dimension 1 for particles where x has them."""
+        arms = x.new_tensor(self.tags)
+        return arms.unsqueeze(1) if x.dim() == 4 else arms
+
     def _own_tags(
         self, process: Process, x: Float[Tensor, "B N S"]
     ) -> tuple[Float[Tensor, "B N T d"], Float[Tensor, "B N T d t"] | None, float]:
@@ -141,11 +156,11 @@ class _Ranges(Measurement):
         position = x[..., None, :d]
         if not self.tags:
             return position, None, 0.0
-        arms = x.new_tensor(self.tags)
+        arms = self._arms(x)
         rotation = process.rotation(x)
         if rotation is None:
             spread = float((arms**2).sum(-1).mean()) / d
-            return position.expand(*x.shape[:2], arms.shape[1], d), None, spread
+            return position.expand(*x.shape[:-1], arms.shape[-2], d), None, spread
         turned = (rotation.unsqueeze(-3) @ arms.unsqueeze(-1))[..., 0]
         if d == 3:
             derivative = -rotation.unsqueeze(-3) @ cross_matrix(arms)
@@ -160,21 +175,25 @@ class _Ranges(Measurement):
         ranges: Float[Tensor, "B N T P"],
         mask: Bool[Tensor, "B N T P"],
         points: Float[Tensor, "B N #T P d"],
+        derivatives: bool,
     ) -> tuple[Block, Float[Tensor, "B N T P d"]]:
         """The block of all (own tag, point) pairs, and the unit vectors from point to tag."""
         tags, derivative, spread = self._own_tags(process, x)
         apart = tags.unsqueeze(-2) - points
-        distance = apart.norm(dim=-1).clamp_min(1e-9)
+        distance = torch.linalg.vector_norm(apart, dim=-1).clamp_min(1e-9)
         unit = apart / distance.unsqueeze(-1)
-        jacobian = x.new_zeros(*unit.shape[:-1], process.error_size)
-        jacobian[..., : process.dim] = unit
-        if derivative is not None:
-            jacobian[..., process.attitude_error] = unit @ derivative
+        jacobian = x.new_zeros(0)
+        if derivatives:
+            jacobian = x.new_zeros(*unit.shape[:-1], process.error_size)
+            jacobian[..., : process.dim] = unit
+            if derivative is not None:
+                jacobian[..., process.attitude_error] = unit @ derivative
+            jacobian = jacobian.flatten(-3, -2).unsqueeze(-2)
         residual = (ranges - distance).flatten(-2).unsqueeze(-1)
         block = Block(
             residual=residual,
-            jacobian=jacobian.flatten(-3, -2).unsqueeze(-2),
-            variance=torch.full_like(residual, self.variance + spread),
+            jacobian=jacobian,
+            variance=x.new_tensor(self.variance + spread).expand_as(residual),
             mask=mask.flatten(-2),
         )
         return block, unit
@@ -193,12 +212,13 @@ class AnchorRanges(_Ranges):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
-        anchors = observation["anchor_map"].double().unflatten(-1, (-1, process.dim))
+        anchors = observation["anchor_map"].to(x.dtype).unflatten(-1, (-1, process.dim))
         shape = (self.n_tags, anchors.shape[-2])
-        ranges = observation["anchor_ranges"].double().unflatten(-1, shape)
+        ranges = observation["anchor_ranges"].to(x.dtype).unflatten(-1, shape)
         mask = (observation["anchor_range_mask"] > 0).unflatten(-1, shape)
-        return self._block(process, x, ranges, mask, anchors.unsqueeze(-3))[0]
+        return self._block(process, x, ranges, mask, anchors.unsqueeze(-3), derivatives)[0]
 
 
 class UavRanges(_Ranges):
@@ -221,6 +241,7 @@ class UavRanges(_Ranges):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
         t, s = self.n_tags, neighbours.known.shape[-1]
 
@@ -230,8 +251,8 @@ class UavRanges(_Ranges):
         points = neighbours.position.repeat_interleave(t, -2).unsqueeze(-3)
         known = neighbours.known.repeat_interleave(t, -1).unsqueeze(-2)
         mask = (by_own_tag(observation["range_mask"]) > 0) & known
-        ranges = by_own_tag(observation["ranges"].double())
-        block, unit = self._block(process, x, ranges, mask, points)
+        ranges = by_own_tag(observation["ranges"].to(x.dtype))
+        block, unit = self._block(process, x, ranges, mask, points, derivatives)
         variance = neighbours.variance.repeat_interleave(t, -2).unsqueeze(-3)
         added = (unit**2 * variance).sum(-1) + self.their_arms
         return Block(
@@ -263,7 +284,7 @@ def _range_bearing(
     along = apart / distance.unsqueeze(-1)
     across = torch.stack((-apart[..., 1], apart[..., 0]), -1) / squared.unsqueeze(-1)
     by_point = torch.stack((along, across), -2)
-    jacobian = x.new_zeros(*z.shape, process.error_size)
+    jacobian = x.new_zeros(*residual.shape, process.error_size)
     jacobian[..., :2] = -by_point
     jacobian[..., 1, process.attitude_error] = -1.0
     return residual, jacobian, by_point
@@ -281,10 +302,11 @@ class LandmarkRangeBearings(Measurement):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
-        z = observation["landmark_bearings"].double().unflatten(-1, (-1, 2))
-        points = observation["landmark_map"].double().unflatten(-1, (-1, 2))
-        points = points.repeat(1, 1, self.depth, 1)
+        z = observation["landmark_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = torch.cat([points] * self.depth, -2)
         residual, jacobian, _ = _range_bearing(process, x, z, points)
         return Block(
             residual=residual,
@@ -308,12 +330,13 @@ class UavRangeBearings(Measurement):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
-        z = observation["uav_bearings"].double().unflatten(-1, (-1, 2))
-        points = neighbours.position.repeat(1, 1, self.depth, 1)
+        z = observation["uav_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = torch.cat([neighbours.position] * self.depth, -2)
         residual, jacobian, by_point = _range_bearing(process, x, z, points)
-        theirs = neighbours.variance.repeat(1, 1, self.depth, 1)
-        known = neighbours.known.repeat(1, 1, self.depth)
+        theirs = torch.cat([neighbours.variance] * self.depth, -2)
+        known = torch.cat([neighbours.known] * self.depth, -1)
         return Block(
             residual=residual,
             jacobian=jacobian,
@@ -336,14 +359,16 @@ class Heights(Measurement):
         x: Float[Tensor, "B N S"],
         observation: Observation,
         neighbours: Neighbours,
+        derivatives: bool = True,
     ) -> Block:
-        z = observation["height"].double().unsqueeze(-1)
-        jacobian = x.new_zeros(*z.shape, process.error_size)
+        z = observation["height"].to(x.dtype).unsqueeze(-1)
+        residual = z - x[..., None, 2:3]
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
         jacobian[..., 2] = 1.0
         return Block(
-            residual=z - x[..., None, 2:3],
+            residual=residual,
             jacobian=jacobian,
-            variance=torch.full_like(z, self.variance),
+            variance=x.new_tensor(self.variance).expand_as(residual),
             mask=observation["height_mask"] > 0,
         )
 

@@ -31,9 +31,9 @@ class Aggressive(Motion):
     The drift is a sine per axis, its rates and phases drawn per world and UAV. The manoeuvres are a
     uniform quintic B-spline (four continuous derivatives) with control points drawn in a box about
     the drift; both together never leave the room less its margin. The drift may use a third of each
-    limit, the manoeuvres two thirds. Limits strictly bound the vectors' lengths; hours of flight with
-    the defaults reach 3.4 m/s (mean 1.1), 6.2 m/s² and 23 m/s³ in the room of ``indoor-v0``. The yaw
-    wanders with the drift, independent of the velocity, so it is defined at zero speed.
+    limit, the manoeuvres two thirds. Limits strictly bound the vectors' lengths; hours of flight in
+    the room of ``indoor-v0`` with the defaults reach 3.4 m/s (mean 1.1), 6.2 m/s² and 23 m/s³. The
+    yaw wanders with the drift, independent of the velocity, so it is defined at zero speed.
     """
 
     max_speed: float = 4.5  # m/s

@@ -1,7 +1,7 @@
 """Where the truth's motion comes from: one seam for scripted, random and recorded motion.
 
 A ``Motion`` gives position, velocity and attitude at any window of steps. Its carry holds what one
-world drew at reset (and, for motions that integrate, their state at the last step sampled), as
+world drew at reset (and, for motions that integrate, their state at the next step to sample), as
 tensors with a leading row dimension, so that rows can be reset alone.
 """
 

@@ -82,7 +82,7 @@ class Helix(Motion):
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
         positive(self, "speed", "radius", "climb", "ramp", "pause")
         only_3d(self, arena)
-        at_most(self, "radius", self._radius(arena), _widest(self, arena), arena)
+        at_most(self, "radius", self._radius(arena), self._widest(arena), arena)
         rise = 2 * half_extents(self, arena, self.margin)[2]
         at_most(self, "climb", self.climb, rise / self.ramp, arena)
         return {"phase": phases(keys, arena.n_uavs, arena.n_uavs)}
@@ -106,8 +106,11 @@ class Helix(Motion):
         velocity = (-self.speed * sine, self.speed * cosine, up * (self.climb * rate))
         return level_flight(position, velocity, (-sine, cosine), 3), carry
 
+    def _widest(self, arena: Arena) -> float:
+        return min(half_extents(self, arena, self.margin)[:2])
+
     def _radius(self, arena: Arena) -> float:
-        return 0.5 * _widest(self, arena) if self.radius is None else self.radius
+        return 0.5 * self._widest(arena) if self.radius is None else self.radius
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,3 @@ class FigureEight(Motion):
 
     def _half_length(self, arena: Arena) -> float:
         return self._longest(arena) if self.half_length is None else self.half_length
-
-
-def _widest(motion: "Helix", arena: Arena) -> float:
-    return min(half_extents(motion, arena, motion.margin)[:2])

@@ -15,9 +15,9 @@ def interval(motion: Motion, setting: str, zero: bool = False) -> tuple[float, f
     """A setting that is a range (smallest, largest) of positive numbers, or from zero on."""
     small, large = getattr(motion, setting)
     if not (0 < small <= large < float("inf") or (zero and 0 == small <= large)):
-        allowed = "from 0 on" if zero else "above 0"
+        above = "from 0 on" if zero else "above 0"
         raise ValueError(
-            f"{_name(motion, setting)} must be (smallest, largest) {allowed}, not {(small, large)!r}"
+            f"{_name(motion, setting)} must be (smallest, largest) {above}, not {(small, large)}"
         )
     return small, large
 

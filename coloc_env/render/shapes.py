@@ -7,6 +7,7 @@ import numpy as np
 
 from coloc_env.motion import Arena
 
+WIDTH, HEIGHT, DPI = 1200, 750, 100  # of the picture, px
 _AZIMUTH, _ELEVATION = math.radians(-62.0), math.radians(33.0)
 _LEAST_HEIGHT = 0.11  # of the arena's longer side: flatter arenas are drawn taller
 

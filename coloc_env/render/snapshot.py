@@ -36,6 +36,11 @@ class Snapshot:
     watching: int
 
     @property
+    def close_links(self) -> bool:
+        """Whether ``links`` holds only each UAV's closest ones."""
+        return len(self.position) > _FULL
+
+    @property
     def error(self) -> np.ndarray:
         """Position errors [N] in m; NaN where there is no truth or no estimate."""
         return np.linalg.norm(self.estimate - self.position, axis=-1)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from coloc_env.geometry import rotation_matrix
+from coloc_env.geometry import rotation_matrix, wrap_angle
 from coloc_env.motion import (
     Circle,
     FigureEight,
@@ -74,7 +74,7 @@ def test_lanes_are_straight_parallel_and_spread(fly, arena):
 
 @pytest.mark.parametrize("n", [1, 2, 5, 6])
 def test_figure_eight_crosses_without_meeting(n, fly, arena):
-    truth = fly(FigureEight(), arena(*ROOM, n=n), [0], 3000)
+    truth = fly(FigureEight(), arena(*ROOM[:2], n=n), [0], 3000)
     speed = truth.velocity[..., :2].norm(dim=-1)
     assert speed.max() == pytest.approx(1.0, abs=1e-3)
     assert truth.position[..., 0].max() == pytest.approx(29.5, abs=1e-2)
@@ -91,6 +91,14 @@ def test_the_sharp_square_of_wsn_v0(fly, arena):
     sides = [(0.6, 0.0), (0.0, 0.6), (-0.6, 0.0), (0.0, -0.6)]
     for k in range(400):
         assert truth.velocity[0, k, 0].tolist() == pytest.approx(sides[k // 100], abs=1e-12)
+
+
+@pytest.mark.parametrize("steps", [3, 7, 29, 49, 107])
+def test_a_sharp_square_turns_on_the_very_step(steps, fly, arena):
+    square = Square(side=6.0, period=4 * steps * 0.1, sharp=True)
+    velocity = fly(square, arena(10.0, 10.0, n=1), [0], 40 * steps).velocity[0, :, 0]
+    turns = (velocity.diff(dim=0).abs().amax(-1) > 0).nonzero()[:, 0] + 1
+    assert turns.tolist() == list(range(steps, 40 * steps, steps))
 
 
 def test_the_square_stops_in_its_corners(fly, arena):
@@ -112,6 +120,10 @@ def test_stop_and_go_stops_each_uav_in_its_turn(fly, arena):
     )
     assert resting.sum(-1).max() < 6  # never all at once
     assert distances(truth.position) > 1
+    place = truth.position[0, -110:, :, :2] - torch.tensor([15.0, 10.0])  # one cycle
+    angle = torch.atan2(place[..., 1], place[..., 0])
+    lead = wrap_angle(angle - angle[:, :1] - math.pi / 3 * torch.arange(6).double()).mean(0)
+    assert lead.abs().max() < 1e-3
 
 
 @pytest.mark.parametrize("n", range(2, 14))

@@ -1,0 +1,1 @@
+"""Particle filtering in parts: the cloud, its likelihood, resampling and tempering."""

@@ -1,0 +1,63 @@
+"""Weighted particles: their moments on the manifold, systematic resampling, regularization."""
+
+import math
+
+import torch
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
+
+from agents.models.process import Process
+
+
+def effective_sample_size(log_weights: Float[Tensor, "*s M"]) -> Float[Tensor, "*s"]:
+    """1 / Σ w² of the normalized weights."""
+    return torch.exp(-torch.logsumexp(2 * log_weights.log_softmax(-1), -1))
+
+
+def moments(
+    process: Process, particles: Float32[Tensor, "B N M S"], weights: Float32[Tensor, "B N M"]
+) -> tuple[Float32[Tensor, "B N S"], Float32[Tensor, "B N M E"]]:
+    """Weighted mean, and every particle's error from it; a heavy particle anchors the mean of
+    attitudes, whose tangents are averaged about it."""
+    heaviest = weights.argmax(-1)[..., None, None].expand(*weights.shape[:2], 1, particles.shape[-1])
+    anchor = particles.gather(2, heaviest)
+    apart = process.boxminus(particles, anchor)
+    shift = (weights.unsqueeze(-2) @ apart)[..., 0, :]
+    mean = process.boxplus(anchor[..., 0, :], shift)
+    return mean, apart - shift.unsqueeze(-2)
+
+
+def weighted_covariance(
+    apart: Float32[Tensor, "B N M E"], weights: Float32[Tensor, "B N M"]
+) -> Float32[Tensor, "B N E E"]:
+    """Σ w δ δᵀ of errors about the mean."""
+    return apart.mT @ (apart * weights.unsqueeze(-1))
+
+
+def systematic(
+    weights: Float32[Tensor, "B N M"], offset: Float32[Tensor, "B N"]
+) -> Int64[Tensor, "B N M"]:
+    """Systematic resampling (Kitagawa 1996): ancestors of M equally weighted particles."""
+    m = weights.shape[-1]
+    cumulative = weights.double().cumsum(-1)
+    cumulative = cumulative / cumulative[..., -1:]
+    rungs = torch.arange(m, device=weights.device) + offset.double().unsqueeze(-1)
+    return torch.searchsorted(cumulative, rungs / m).clamp_max(m - 1)
+
+
+def liu_west(
+    process: Process,
+    mean: Float32[Tensor, "B N S"],
+    apart: Float32[Tensor, "B N M E"],
+    covariance: Float32[Tensor, "B N E E"],
+    noise: Float32[Tensor, "B N M E"],
+    shrink: float,
+    floor: Float32[Tensor, "E"],
+) -> Float32[Tensor, "B N M S"]:
+    """Regularization x ← μ ⊞ (√(1−h²) (x ⊟ μ) + N(0, h² Σ + floor)) (Liu & West 2001), which
+    keeps the cloud's mean and, floor aside, its covariance. ``shrink`` is h."""
+    factor = torch.linalg.cholesky_ex(
+        (shrink**2 * covariance + torch.diag(floor**2)).double()
+    ).L.to(noise.dtype)
+    moved = math.sqrt(1 - shrink**2) * apart + noise @ factor.mT
+    return process.boxplus(mean.unsqueeze(-2), moved)

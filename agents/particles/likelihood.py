@@ -1,0 +1,103 @@
+"""Log-likelihoods of particles, up to a constant per UAV."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from agents.models import rotations
+from agents.models.measurements import (
+    Block,
+    LandmarkVectors,
+    Measurement,
+    Neighbours,
+    UavRanges,
+)
+from agents.models.process import Process
+from coloc_env.observation import Observation
+
+
+def landmark_log_likelihood(
+    model: LandmarkVectors,
+    process: Process,
+    particles: Float32[Tensor, "B N M S"],
+    centre: Float32[Tensor, "B N S"],
+    observation: Observation,
+) -> Float32[Tensor, "B N M"]:
+    """−Σ‖z − Rᵀ(L − p)‖² / 2σ² over landmarks, from sums over landmarks made once per UAV:
+
+    Σ‖z − Rᵀ(L − p)‖² = n‖p‖² − 2 p·(ΣL − R Σz) − 2 tr(R Σ z Lᵀ) + const,
+
+    so a particle costs O(1). Exact; p and L are taken about the centre's position and R about the
+    centre's rotation (R = R̄ + ΔR), which keeps float32 from cancelling.
+    """
+    d = process.dim
+    z = observation["landmarks"].unflatten(-1, (-1, d))
+    visible = observation["landmark_mask"].unsqueeze(-1)
+    points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
+    points = points * visible
+    at = process.rotation(centre)
+    if at is None:
+        raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
+    count, sum_z = visible.sum((-2, -1)), z.sum(-2)
+    p = particles[..., :d] - centre[..., None, :d]
+    turn = rotations.matrix_difference(
+        process.attitude(particles), process.attitude(centre).unsqueeze(-2)
+    )
+    # ΔR enters through ΔR Σz and tr(ΔR Σ z Lᵀ): one product with a [d², d + 1] matrix.
+    by_row = torch.zeros(*sum_z.shape[:-1], d, d, d + 1, device=z.device)
+    for row in range(d):
+        by_row[..., row, :, row] = sum_z
+    by_row[..., d] = points.mT @ z
+    turned = turn @ by_row.flatten(-3, -2)
+    fixed = points.sum(-2) - (at @ sum_z.unsqueeze(-1))[..., 0]
+    along = (p * (count[..., None, None] * p + 2 * (turned[..., :d] - fixed.unsqueeze(-2)))).sum(-1)
+    return (along - 2 * turned[..., d]) * (-0.5 / model.std**2)
+
+
+def range_log_likelihood(
+    block: Block, ranges: Float32[Tensor, "B N S"], particles: Tensor, points: Tensor
+) -> Float32[Tensor, "B N M"]:
+    """−Σ (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre."""
+    distance = torch.cdist(particles, points, compute_mode="donot_use_mm_for_euclid_dist")
+    weight = block.mask / block.total_variance[..., 0]
+    return ((distance - ranges.unsqueeze(-2)) ** 2 @ weight.unsqueeze(-1))[..., 0] * -0.5
+
+
+def log_likelihood(
+    models: Sequence[Measurement],
+    process: Process,
+    particles: Float32[Tensor, "B N M S"],
+    centre: Float32[Tensor, "B N S"],
+    observation: Observation,
+    neighbours: Neighbours,
+) -> Float32[Tensor, "B N M"]:
+    """Sum over all sensors' measurements; what a neighbour's uncertainty adds to a range's variance
+    is taken at the centre."""
+    total = torch.zeros_like(particles[..., 0])
+    d = process.dim
+    wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
+    near = Neighbours(
+        neighbours.position.to(total.dtype), neighbours.variance.to(total.dtype), neighbours.known
+    )
+    spread = Neighbours(
+        near.position.unsqueeze(2), near.variance.unsqueeze(2), near.known.unsqueeze(2)
+    )
+    for model in models:
+        if isinstance(model, LandmarkVectors):
+            total = total + landmark_log_likelihood(model, process, particles, centre, observation)
+            continue
+        if isinstance(model, UavRanges) and not model.tags:
+            block = model.linearize(process, centre, observation, near, derivatives=False)
+            total = total + range_log_likelihood(
+                block, observation["ranges"], particles[..., :d], near.position
+            )
+            continue
+        block = model.linearize(process, particles, wide, spread, derivatives=False)
+        variance = block.total_variance
+        squared = block.residual**2 / variance
+        if block.partner_variance is not None:
+            squared = squared + variance.log()
+        total = total - 0.5 * (squared.sum(-1) * block.mask).sum(-1)
+    return total

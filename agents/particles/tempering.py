@@ -1,0 +1,30 @@
+"""How much of a likelihood to use at once: increments that keep enough particles alive."""
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from agents.particles.cloud import effective_sample_size
+
+_BISECTIONS = 12
+
+
+def increment(
+    log_weights: Float32[Tensor, "B N M"],
+    log_likelihood: Float32[Tensor, "B N M"],
+    left: Float32[Tensor, "B N"],
+    target: float,
+) -> Float32[Tensor, "B N"]:
+    """The largest share β ≤ ``left`` of the log-likelihood that keeps the effective sample size at
+    ``target`` · M, by bisection (adaptive tempering, Del Moral, Doucet & Jasra 2012)."""
+    goal = target * log_weights.shape[-1]
+
+    def enough(beta: Tensor) -> Tensor:
+        return effective_sample_size(log_weights + beta.unsqueeze(-1) * log_likelihood) >= goal
+
+    low, high = torch.zeros_like(left), left
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        good = enough(middle)
+        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
+    return torch.where(enough(left), left, low)

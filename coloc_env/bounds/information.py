@@ -1,0 +1,220 @@
+"""Fisher information of each sensor about its UAVs' poses, at the truth.
+
+Information matrices are over pose errors (δp in m, world; δθ in rad, right: R exp(δθ)), D = 6 in
+space and 3 in the plane. ``truth`` is [B, N, …]; the masks of ``seen`` say which measurements
+arrived in just this world and step, and their values are never looked at. A modality is one
+function here: ``own_information`` [B, N, D, D] for what one UAV measures of the world, or
+``shared_information`` [B, N, D, N, D] for what ties two UAVs together.
+
+For z = h(x) + noise each contributes Hᵀ R⁻¹ H (Kay 1993, eq. 3.31), R the *true* noise.
+"""
+
+from functools import singledispatch
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from coloc_env.bounds.mixture import EXACT, range_information
+from coloc_env.geometry import cross_matrix, rotation_matrix
+from coloc_env.motion import Kinematics
+from coloc_env.observation import Observation
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    LandmarkBearings,
+    Landmarks,
+    Ranging,
+    Sensor,
+    UavBearings,
+)
+from coloc_env.sensors.ranging import Tags, tag_positions
+
+SHARED = (Ranging, UavBearings)  # sensors between UAVs
+
+
+@singledispatch
+def own_information(
+    sensor: Sensor, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """Information of a sensor that measures the world, about each UAV's own pose."""
+    raise NotImplementedError(f"bounds: no Fisher information is known for {type(sensor).__name__}")
+
+
+@singledispatch
+def shared_information(
+    sensor: Sensor, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D N D"]:
+    """Information of a sensor between UAVs, about the team's joint pose."""
+    raise NotImplementedError(f"bounds: no Fisher information is known for {type(sensor).__name__}")
+
+
+# ---------------------------------------------------------------- what a UAV measures of the world
+
+
+@own_information.register
+def _landmarks(
+    sensor: Landmarks, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """z = Rᵀ(L − p) + N(0, σ² I).
+
+    With a fraction ε of false matches, what is seen under a landmark's name is it with probability
+    1 − ε and each other one with ε/(L−1). Which one it was is taken as told: no estimator, not even
+    one that re-associates, knows more, so the bound holds for all of them. (That of estimators that
+    only discard false matches has (1 − ε) times the information.)
+    """
+    visible = _mask(seen, "landmark_mask")
+    others = sensor.false_matches / max(sensor.count - 1, 1)
+    correct = 1 - others * (sensor.count - 1)
+    expected = (correct - others) * visible + others * visible.sum(-1, keepdim=True)
+    _, jacobian = _relative(truth, _points(seen, "landmark_map", truth))
+    return _gram(jacobian, expected / max(sensor.std, EXACT) ** 2)
+
+
+@own_information.register
+def _landmark_bearings(
+    sensor: LandmarkBearings, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """Range and bearing of Rᵀ(L − p), each with Gaussian noise."""
+    count = _mask(seen, "landmark_bearing_mask").unflatten(-1, (sensor.depth, -1)).sum(-2)
+    apart, jacobian = _relative(truth, _points(seen, "landmark_map", truth))
+    polar = _polar_jacobian(apart, sensor.range_std, sensor.bearing_std) @ jacobian
+    return _gram(polar, count)
+
+
+@own_information.register
+def _anchor_ranging(
+    sensor: AnchorRanging, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """d = ‖p + R l_a − A_m‖ + noise, for own tag a and anchor m."""
+    arrived = _mask(seen, "anchor_range_mask").unflatten(-1, (sensor.n_tags, -1))
+    tags, jacobian = _tags(truth, sensor.tags)
+    toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
+    rows = toward @ jacobian  # [B, N, T, A, D]
+    weights = arrived * range_information(sensor.noise)
+    return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
+
+
+@own_information.register
+def _height(sensor: Height, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """z = p_z + N(0, σ²)."""
+    row = truth.position.new_zeros(*truth.position.shape[:2], 1, 1, 6)
+    row[..., 2] = 1.0
+    return _gram(row, _mask(seen, "height_mask") / max(sensor.std, EXACT) ** 2)
+
+
+# ---------------------------------------------------------------- what ties two UAVs together
+
+
+@shared_information.register
+def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D N D"]:
+    """d = ‖p_i + R_i l_a − p_j − R_j l_b‖ + noise: one draw that both ends read, counted once.
+
+    Over the tags' positions this is a Laplacian with u uᵀ for weights, u the unit vector along a
+    link; the tags' Jacobians take it to the poses.
+    """
+    t = sensor.n_tags
+    arrived = _mask(seen, "range_mask").unflatten(-1, (-1, t * t))
+    links = _by_uav(arrived, seen).unflatten(-1, (t, t)).transpose(2, 3)  # [B, i, a, j, b]
+    links = links.flatten(1, 2).flatten(2, 3)
+    links = torch.maximum(links, links.transpose(1, 2)) * range_information(sensor.noise)
+    tags, jacobian = _tags(truth, sensor.tags)
+    points = tags.flatten(1, 2)
+    along = _unit(points.unsqueeze(2) - points.unsqueeze(1))
+    weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)
+    laplacian = -weights
+    laplacian.diagonal(dim1=1, dim2=2).add_(weights.sum(2).movedim(1, -1))
+    laplacian = laplacian.unflatten(2, (-1, t)).unflatten(1, (-1, t))
+    return torch.einsum("bitxd,bitjsxy,bjsye->bidje", jacobian, laplacian, jacobian)
+
+
+@shared_information.register
+def _uav_bearings(
+    sensor: UavBearings, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D N D"]:
+    """Range and bearing of R_iᵀ(p_j − p_i), each end measuring for itself."""
+    arrived = _mask(seen, "uav_bearing_mask").unflatten(-1, (sensor.depth, -1)).sum(-2)
+    weights = _by_uav(arrived.unsqueeze(-1), seen).squeeze(-1)
+    n = weights.shape[1]
+    apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, n, -1, -1))
+    polar = _polar_jacobian(apart, sensor.range_std, sensor.bearing_std)
+    own = polar @ own
+    other = torch.zeros_like(own)
+    other[..., :2] = -own[..., :2]  # only p_j − p_i matters, and the other's heading not at all
+    between = torch.einsum("bijxd,bij,bijxe->bidje", own, weights, other)
+    joint = between + between.permute(0, 3, 4, 1, 2)
+    ends = _gram(own, weights) + _gram(other.transpose(1, 2), weights.transpose(1, 2))
+    joint.diagonal(dim1=1, dim2=3).add_(ends.movedim(1, -1))
+    return joint
+
+
+# ---------------------------------------------------------------- parts
+
+
+def _mask(seen: Observation, name: str) -> Float64[Tensor, "B N F"]:
+    return seen[name].double()
+
+
+def _points(seen: Observation, name: str, truth: Kinematics) -> Float64[Tensor, "B N L d"]:
+    return seen[name].double().unflatten(-1, (-1, truth.position.shape[-1]))
+
+
+def _by_uav(slots: Float64[Tensor, "B N S k"], seen: Observation) -> Float64[Tensor, "B N N k"]:
+    """From neighbour slots to UAV indices."""
+    if "neighbours" not in seen:
+        return slots
+    n = slots.shape[1]
+    index = seen["neighbours"].to(torch.int64).unsqueeze(-1).expand_as(slots)
+    return slots.new_zeros(*slots.shape[:2], n, slots.shape[-1]).scatter_add(2, index, slots)
+
+
+def _gram(
+    rows: Float64[Tensor, "B N M x D"], weights: Float64[Tensor, "B N M"]
+) -> Float64[Tensor, "B N D D"]:
+    """``Σ_m w_m H_mᵀ H_m``."""
+    weighted = rows * weights[..., None, None]
+    return rows.flatten(2, 3).mT @ weighted.flatten(2, 3)
+
+
+def _unit(v: Float64[Tensor, "*s d"]) -> Float64[Tensor, "*s d"]:
+    """The direction of v; 0 where it has none."""
+    return v / v.norm(dim=-1, keepdim=True).clamp_min(EXACT)
+
+
+def _turn(v: Float64[Tensor, "*s d"]) -> Float64[Tensor, "*s d t"]:
+    """Derivative of ``exp(−δθ) v``, that is of ``Rᵀ x`` where v = Rᵀ x: [v]× or (v_y, −v_x)."""
+    if v.shape[-1] == 3:
+        return cross_matrix(v)
+    return torch.stack((v[..., 1], -v[..., 0]), -1).unsqueeze(-1)
+
+
+def _relative(
+    truth: Kinematics, points: Float64[Tensor, "B N L d"]
+) -> tuple[Float64[Tensor, "B N L d"], Float64[Tensor, "B N L d D"]]:
+    """Body-frame vectors ``Rᵀ(x − p)`` to points and their Jacobians ``[−Rᵀ, [·]×]``."""
+    rotation = rotation_matrix(truth.attitude)
+    apart = (points - truth.position.unsqueeze(-2)) @ rotation
+    back = -rotation.mT.unsqueeze(-3).expand(*apart.shape, -1)
+    return apart, torch.cat((back, _turn(apart)), -1)
+
+
+def _polar_jacobian(
+    apart: Float64[Tensor, "*s 2"], range_std: float, bearing_std: float
+) -> Float64[Tensor, "*s 2 2"]:
+    """Derivatives of a vector's length and angle by the vector, in standard deviations."""
+    along = _unit(apart)
+    across = torch.stack((-along[..., 1], along[..., 0]), -1)
+    distance = apart.norm(dim=-1, keepdim=True).clamp_min(EXACT)
+    by_range = along / max(range_std, EXACT)
+    return torch.stack((by_range, across / distance / max(bearing_std, EXACT)), -2)
+
+
+def _tags(
+    truth: Kinematics, tags: Tags
+) -> tuple[Float64[Tensor, "B N T d"], Float64[Tensor, "B N T d D"]]:
+    """World positions ``p + R l`` of each UAV's tags and their Jacobians ``[I, −R [l]×]``."""
+    positions = tag_positions(truth, tags)
+    arms = positions.new_tensor(tags) if tags else torch.zeros_like(positions[0])
+    turned = -rotation_matrix(truth.attitude).unsqueeze(-3) @ _turn(arms)
+    identity = torch.eye(positions.shape[-1], dtype=torch.float64, device=positions.device)
+    return positions, torch.cat((identity.expand(*positions.shape, -1), turned), -1)

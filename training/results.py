@@ -1,0 +1,268 @@
+"""Results of an evaluation: the figures of ``results.json``, as tables, and as a folder of files."""
+
+import csv
+import io
+import json
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coloc_env.bounds import Bound
+from coloc_env.scenario import Scenario
+from training import metrics
+from training.metrics import Difference, Flags, Floats
+
+FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
+NAMES = ("results.csv", "table.md", *FIGURES, "tum", "results.json")
+COLUMNS = {
+    "rmse": "RMSE",
+    "rmse_std": "± over runs",
+    "mean": "mean",
+    "median": "median",
+    "max": "max",
+    "rmse_after_10s": "RMSE after 10 s",
+    "diverged_runs": "diverged",
+    "nees": "NEES",
+    "avg_particles": "particles",
+    "ms_per_step": "ms/step",
+    "ratio_to_bound": "× bound",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class AgentResult:
+    """What an agent did in R runs of K steps with N UAVs.
+
+    ``offset`` p̂ − p [R, K, N, d] and ``error`` its length [R, K, N], m; ``nees`` [R, K, N] of the
+    position, NaN where the covariance is not positive definite; ``broken`` [R]: runs with NaN,
+    infinity or a numerical error, ``raised`` of them with the latter, ``message`` the first;
+    ``series``: the method's own figures [R, K, N]; ``ms_per_step`` of the whole team, B = 1.
+    """
+
+    offset: Floats
+    error: Floats
+    nees: Floats
+    broken: Flags
+    raised: int
+    message: str | None
+    series: dict[str, Floats]
+    ms_per_step: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """All agents on the same R worlds, seeded ``seed`` … ``seed`` + R − 1.
+
+    ``truth`` [R, K, N, d] m; ``attitude`` [K, N, a] of the first run; ``scored`` [R, K, N].
+    """
+
+    scenario: Scenario
+    seed: int
+    truth: Floats
+    attitude: Floats
+    scored: Flags
+    bound: Bound | None
+    agents: dict[str, AgentResult]
+
+    @property
+    def runs(self) -> int:
+        return len(self.truth)
+
+    @property
+    def dt(self) -> float:
+        """Seconds a step."""
+        return self.scenario.arena.dt
+
+    @property
+    def lost_beyond(self) -> float:
+        """The error in m beyond which a UAV counts as lost: a tenth of the arena's longest side."""
+        arena = self.scenario.arena
+        sides = [b - a for a, b in zip(arena.low, arena.high, strict=True)]
+        return metrics.LOST_SHARE * max(sides)
+
+    def diverged(self, agent: str) -> Flags:
+        """[R]: runs in which a UAV ends lost or an estimate was not finite."""
+        one = self.agents[agent]
+        lost = metrics.lost(one.error, self.scored, self.dt, self.lost_beyond)
+        return one.broken | lost.any(1)
+
+    def paired_difference(self, a: str, b: str) -> Difference:
+        """RMSE of agent ``a`` minus that of ``b``, run by run: mean and 95 % interval, m."""
+        return metrics.paired_difference(
+            *(metrics.rmse_per_run(self.agents[x].error, self.scored) for x in (a, b))
+        )
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of ``results.json``: numbers, and None where a figure does not apply."""
+        scenario = self.scenario
+        return {
+            "scenario": scenario.name,
+            "overrides": {k: _plain(v) for k, v in scenario.overrides.items()},
+            "seed": self.seed,
+            "runs": self.runs,
+            "steps": scenario.horizon,
+            "bound": {"rmse": None if self.bound is None else _number(self.bound.rmse)},
+            "agents": {name: self._figures(name) for name in self.agents},
+        }
+
+    def _figures(self, agent: str) -> dict[str, Any]:
+        one, scored = self.agents[agent], self.scored
+        errors, per_run = one.error[scored], metrics.rmse_per_run(one.error, scored)
+        per_run = per_run[np.isfinite(per_run)]
+        rmse = metrics.rmse(one.error, scored)
+        bound = float("nan") if self.bound is None else self.bound.rmse
+        own = {name: metrics.mean(values[scored]) for name, values in one.series.items()}
+        figures: dict[str, Any] = {
+            "rmse": rmse,
+            "rmse_std": per_run.std(ddof=1) if len(per_run) > 1 else None,
+            "mean": metrics.mean(errors),
+            "median": np.median(errors) if errors.size else None,
+            "max": metrics.largest(one.error, scored),
+            "per_uav_rmse": metrics.rmse_per_uav(one.error, scored).tolist(),
+            "rmse_after_10s": metrics.rmse_after(one.error, scored, self.dt, 10.0),
+            "diverged_runs": int(self.diverged(agent).sum()),
+            "nees": metrics.mean(one.nees[scored]),
+            "avg_particles": own.pop("particles", None),
+            "ms_per_step": one.ms_per_step,
+            "ratio_to_bound": rmse / bound if bound > 0 else None,
+            "diagnostics": self._diagnostics(agent) | own,
+        }
+        return {key: _plain(value) for key, value in figures.items()}
+
+    def _diagnostics(self, agent: str) -> dict[str, float]:
+        one, scored, dim = self.agents[agent], self.scored, self.scenario.arena.dim
+        errors = one.error[scored]
+        low, high = metrics.nees_band(dim, max(1, int(scored.any(1).sum())))
+        figures = {
+            "p90": float(np.percentile(errors, 90)) if errors.size else float("nan"),
+            "ate": metrics.ate(one.error, scored),
+            "rpe_1s": metrics.rpe(one.offset, scored, max(1, round(1 / self.dt))),
+            "nees_low": low,
+            "nees_high": high,
+        }
+        if self.scenario.arena.n_uavs > 1:
+            figures["relative_error"] = metrics.relative_error(one.offset, scored)
+            figures["fge"] = metrics.formation_error(self.truth, one.offset, scored)
+        if self.scenario.network.radius is not None:
+            figures["nrmse"] = metrics.rmse(one.error, scored) / self.scenario.network.radius
+        undefined = float(np.isnan(one.nees[scored]).mean()) if errors.size else 0.0
+        if undefined:
+            figures["nees_undefined_share"] = undefined
+        if one.raised:
+            figures["raised_runs"] = one.raised
+        return figures
+
+
+def _number(value: float) -> float | int | None:
+    """A plain number; None for NaN and infinity."""
+    value = value.item() if isinstance(value, np.generic) else value
+    return value if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON knows it."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value if value is None or isinstance(value, str | bool) else _number(value)
+
+
+# ------------------------------------------------------------------ tables and files
+
+
+def rows(results: Results) -> list[list[str]]:
+    """The main table as text: one line for the bound, if known, and one per agent."""
+    bound, lines = results.bound, []
+    if bound is not None:
+        known = {"rmse": bound.rmse, "rmse_after_10s": bound.rmse_after(10.0)}
+        lines.append(["bound", *(_short(_plain(known.get(key))) for key in COLUMNS)])
+    for name, figures in results.summary["agents"].items():
+        lines.append([name, *(_short(figures[key]) for key in COLUMNS)])
+    return lines
+
+
+def markdown(results: Results) -> str:
+    """The main table, paired differences to the first agent, and what the words mean."""
+    names, dim = list(results.agents), results.scenario.arena.dim
+    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    if results.scenario.overrides:
+        chosen = (f"`{key}={value}`" for key, value in results.scenario.overrides.items())
+        text += ["Overrides: " + ", ".join(chosen) + ".", ""]
+    text += _table(["agent", *COLUMNS.values()], rows(results))
+    text += [
+        "",
+        f"Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs; max is "
+        f"the mean over runs and UAVs of the largest error. A run counts as diverged if a UAV's error "
+        f"stays above {results.lost_beyond:g} m over its last {metrics.LOST_SECONDS:g} s, or if an "
+        f"estimate was not finite; it stays in every figure. NEES: {dim} is consistent, more is "
+        "overconfident. ms/step: the whole team, one world, one thread.",
+    ]
+    if len(names) > 1 and results.runs > 1:
+        differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
+        text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
+        text += _table(["agent", "mean difference", "95 % interval"], differences)
+    failed = [(name, one) for name, one in results.agents.items() if one.raised]
+    for name, one in failed:
+        text += ["", f"`{name}` raised in {one.raised} of {results.runs} runs, first: {one.message}"]
+    return "\n".join(text) + "\n"
+
+
+def csv_text(results: Results) -> str:
+    """One line per agent; empty where a figure does not apply."""
+    lines = []
+    for name, figures in results.summary["agents"].items():
+        per_uav = {f"rmse_uav_{i}": x for i, x in enumerate(figures["per_uav_rmse"])}
+        line = {k: v for k, v in figures.items() if k not in ("per_uav_rmse", "diagnostics")}
+        lines.append({"agent": name} | line | figures["diagnostics"] | per_uav)
+    out = io.StringIO()
+    columns = list(dict.fromkeys(key for line in lines for key in line))
+    writer = csv.DictWriter(out, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return out.getvalue()
+
+
+def write(results: Results, folder: Path, figures: bool = True) -> None:
+    """Write everything into an empty folder (a staged one: ``training.staging``)."""
+    from training.tum import write_tum
+
+    (folder / "results.csv").write_text(csv_text(results), encoding="utf-8")
+    (folder / "table.md").write_text(markdown(results), encoding="utf-8")
+    write_tum(results, folder / "tum")
+    if figures:
+        from training.figures import draw
+
+        draw(results, folder)
+    text = json.dumps(results.summary, indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / "results.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _interval(results: Results, a: str, b: str) -> list[str]:
+    difference = results.paired_difference(a, b)
+    return [_signed(difference.mean), f"{_signed(difference.low)} to {_signed(difference.high)}"]
+
+
+def _table(header: list[str], lines: list[list[str]]) -> list[str]:
+    every = [header, ["---", *["---:"] * (len(header) - 1)], *lines]
+    return ["| " + " | ".join(cells) + " |" for cells in every]
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2g}".replace("-", "−")
+
+
+def _short(value: float | None) -> str:
+    """Three digits, no exponent where it can be helped."""
+    if value is None:
+        return "–"
+    if isinstance(value, int) or 100 <= abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.3g}"
