@@ -20,12 +20,14 @@ from agents.particles.cloud import (
     effective_sample_size,
     liu_west,
     moments,
+    select,
     systematic,
     weighted_covariance,
 )
 from agents.particles.likelihood import log_likelihood
 from agents.particles.tempering import increment
 from coloc_env import noise
+from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
@@ -93,14 +95,14 @@ class ParticleFilter(Localizer[ParticleBelief]):
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
         e, m, d = self.process.error_size, self.particles, self.process.dim
-        draws = noise.normal(key, "pf.reset", m * e).unflatten(-1, (m, e))
+        draws = noise.normal(key, "pf.reset", m * e).unflatten(-1, (e, m)).mT
         delta = draws * covariance.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)
         particles = self.process.boxplus(mean.unsqueeze(-2).expand(-1, -1, m, -1), delta)
         if self.believed.prior.kind == "uniform":
             arena = self.believed.arena
             low, high = (prior.new_tensor(x) for x in (arena.low, arena.high))
-            place = noise.uniform(key, "pf.place", m * d).unflatten(-1, (m, d))
-            particles = torch.cat((low + place * (high - low), particles[..., d:]), -1)
+            place = noise.uniform(key, "pf.place", m * d).unflatten(-1, (d, m)).mT
+            particles = concat((low + place * (high - low), particles[..., d:]))
         return ParticleBelief(
             particles=particles,
             log_weights=torch.full_like(particles[..., 0], -math.log(m)),
@@ -151,7 +153,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> Float32[Tensor, "B N M S"]:
         """Each particle moves with its own draw of the motion's noise."""
         m, w = self.particles, self.process.noise_size
-        draws = noise.normal(key, "pf.predict", m * w).unflatten(-1, (m, w))
+        draws = noise.normal(key, "pf.predict", m * w).unflatten(-1, (w, m)).mT
         u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
         return self.process.propagate(belief.particles, u, dt, draws)
@@ -169,8 +171,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         neighbours = heard(self.believed, observation)
 
         def evidence() -> Float32[Tensor, "B N M"]:
-            heaviest = log_weights.argmax(-1)[..., None, None]
-            centre = particles.gather(2, heaviest.expand(-1, -1, 1, particles.shape[-1]))[..., 0, :]
+            centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
             return log_likelihood(
                 self.models, self.process, particles, centre, observation, neighbours
             )
@@ -212,10 +213,9 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """Equally weighted particles drawn from the weighted ones, then moved apart."""
         m, e = self.particles, self.process.error_size
         ancestors = systematic(weights, noise.uniform(key, "pf.offset", 1)[..., 0])
-        apart = apart.gather(2, ancestors.unsqueeze(-1).expand(-1, -1, -1, e))
-        draws = noise.normal(key, "pf.move", m * e).unflatten(-1, (m, e))
+        draws = noise.normal(key, "pf.move", m * e).unflatten(-1, (e, m)).mT
         floor = self.floor.to(draws.device)
-        return liu_west(self.process, mean, apart, covariance, draws, self.shrink, floor)
+        return liu_west(self.process, mean, select(apart, ancestors), covariance, draws, self.shrink, floor)
 
 
 def _per_error(process: Process, std: dict[str, float]) -> list[float]:

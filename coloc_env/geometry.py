@@ -9,46 +9,58 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Parts = list[Tensor] | tuple[Tensor, ...]
 _SMALL = 1e-4  # below this angle squared the Taylor series are exact to rounding in float64
+
+
+def join(components: Parts) -> Float[Tensor, "*s n"]:
+    """Scalars as the last dimension of one tensor, each of them contiguous in memory: elementwise
+    work on components then runs at full speed however many vectors there are."""
+    return torch.stack(tuple(components)).movedim(0, -1)
+
+
+def concat(parts: Parts) -> Float[Tensor, "*s n"]:
+    """Vectors side by side in the last dimension, in the memory order of ``join``."""
+    return torch.cat([part.movedim(-1, 0) for part in parts]).movedim(0, -1)
 
 
 def cross_matrix(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3 3"]:
     """``[v]×``, so that ``[v]× w = v × w``."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    return join((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(-1, (3, 3))
 
 
 def quaternion_product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
     """Hamilton product ``a ⊗ b``: rotate by ``b`` first, then by ``a``."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
+    return join(
         (
             aw * bw - ax * bx - ay * by - az * bz,
             aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        -1,
+        )
     )
 
 
 def quaternion_conjugate(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
     """The inverse rotation of a unit quaternion."""
-    return torch.cat((q[..., :1], -q[..., 1:]), -1)
+    return concat((q[..., :1], -q[..., 1:]))
 
 
 def quaternion_exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
     """Rotation vector (rad) to unit quaternion; differentiable at zero."""
-    squared = (v * v).sum(-1, keepdim=True)
+    x, y, z = v.unbind(-1)
+    squared = (x * x + y * y + z * z).unsqueeze(-1)
     small = squared < _SMALL
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     scale = torch.where(
         small, 0.5 - squared / 48 + squared * squared / 3840, (0.5 * angle).sin() / angle
     )
     real = torch.where(small, 1 - squared / 8 + squared * squared / 384, (0.5 * angle).cos())
-    return torch.cat((real, scale * v), -1)
+    return concat((real, scale * v))
 
 
 def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
@@ -69,7 +81,7 @@ def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
 def quaternion_matrix(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3 3"]:
     """Rotation matrix of a unit quaternion."""
     w, x, y, z = q.unbind(-1)
-    return torch.stack(
+    return join(
         (
             1 - 2 * (y * y + z * z),
             2 * (x * y - w * z),
@@ -80,15 +92,14 @@ def quaternion_matrix(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3 3"]:
             2 * (x * z - w * y),
             2 * (y * z + w * x),
             1 - 2 * (x * x + y * y),
-        ),
-        -1,
+        )
     ).unflatten(-1, (3, 3))
 
 
 def yaw_quaternion(yaw: Float[Tensor, "*s"]) -> Float[Tensor, "*s 4"]:
     """Rotation about the world's vertical axis."""
     zero = torch.zeros_like(yaw)
-    return torch.stack(((0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()), -1)
+    return join(((0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()))
 
 
 def plane_angle(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
@@ -118,7 +129,8 @@ def rotate_by(attitude: Float[Tensor, "*s a"], delta: Float[Tensor, "*s t"]) -> 
     """``attitude ⊞ delta``: a right (body-frame) perturbation, t = 3 or 1."""
     if attitude.shape[-1] == 4:
         turned = quaternion_product(attitude, quaternion_exp(delta))
-        return turned / turned.norm(dim=-1, keepdim=True)
+        w, x, y, z = turned.unbind(-1)
+        return turned / (w * w + x * x + y * y + z * z).sqrt().unsqueeze(-1)
     return wrap_angle(attitude + delta)
 
 
@@ -153,9 +165,12 @@ def _turn(
     """``v + 2w (u × v) + 2u × (u × v)``: a unit quaternion applied to a vector."""
     (x, y, z), (a, b, c) = u, v.unbind(-1)
     tx, ty, tz = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return torch.stack(
-        (a + w * tx + (y * tz - z * ty), b + w * ty + (z * tx - x * tz), c + w * tz + (x * ty - y * tx)),
-        -1,
+    return join(
+        (
+            a + w * tx + (y * tz - z * ty),
+            b + w * ty + (z * tx - x * tz),
+            c + w * tz + (x * ty - y * tx),
+        )
     )
 
 
@@ -163,4 +178,4 @@ def _turn_plane(
     cosine: Float[Tensor, "*s"], sine: Float[Tensor, "*s"], v: Float[Tensor, "*s 2"]
 ) -> Float[Tensor, "*s 2"]:
     a, b = v.unbind(-1)
-    return torch.stack((cosine * a - sine * b, sine * a + cosine * b), -1)
+    return join((cosine * a - sine * b, sine * a + cosine * b))

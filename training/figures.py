@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -9,10 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from coloc_env.render.style import GRID, INK, MUTED, uav_colours
 from training import metrics
-from training.metrics import Floats
+from training.metrics import Flags, Floats
 from training.results import FIGURES, Results
 
 STYLE = {
@@ -25,20 +27,22 @@ STYLE = {
     "axes.spines.top": False,
     "axes.titlelocation": "left",
     "axes.titlesize": 11.0,
+    "axes.titleweight": "bold",
     "font.family": "DejaVu Sans",
     "font.size": 10.0,
     "grid.color": GRID,
     "grid.linewidth": 0.8,
     "legend.fontsize": 9.0,
     "legend.frameon": False,
-    "lines.linewidth": 1.6,
     "text.color": INK,
     "xtick.color": MUTED,
     "xtick.labelcolor": INK,
     "ytick.color": MUTED,
     "ytick.labelcolor": INK,
 }
-_SHOWN = 6  # UAVs whose trajectories are drawn
+_BOUND: dict[str, Any] = {"color": "black", "linestyle": (0, (5, 3)), "linewidth": 1.3, "zorder": 5}
+_TRUTH: dict[str, Any] = {"color": "#c4cad6", "linewidth": 5}
+_IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
 
 
 def draw(results: Results, folder: Path) -> None:
@@ -52,159 +56,172 @@ def draw(results: Results, folder: Path) -> None:
     )
     for name, drawing in zip(FIGURES, drawings, strict=True):
         with mpl.rc_context(STYLE):
-            figure = drawing(results)
-            figure.savefig(folder / name, dpi=150)
+            drawing(results).savefig(folder / name, dpi=150)
 
 
 def error_over_time(results: Results) -> Figure:
     """RMS error over runs and UAVs at each step, with the middle half of the errors."""
-    figure, axes = _figure(results, "Position error over time")
+    note = "line: root mean square over runs and UAVs; shade: middle half of the errors"
+    figure, axes = _figure(results, "Position error over time", note)
     time = _time(results)
-    for name, colour in _colours(results).items():
+    for name, look in _looks(results).items():
         error = results.agents[name].error
-        axes.plot(time, metrics.rmse_per_step(error, results.scored), color=colour)
-        quarter = _quantiles_per_step(error, results.scored, (0.25, 0.75))
-        axes.fill_between(time, *quarter, color=colour, alpha=0.15, linewidth=0)
+        axes.plot(time, metrics.rmse_per_step(error, results.scored), **look)
+        half = _quantiles_per_step(error, results.scored, (0.25, 0.75))
+        axes.fill_between(time, *half, color=look["color"], alpha=0.12, linewidth=0)
     if results.bound is not None:
         bound = results.bound.mse.numpy() ** 0.5
         axes.plot(time, metrics.rmse_per_step(bound, results.bound.scored.numpy()), **_BOUND)
-    axes.set(xlabel="time (s)", ylabel="position error (m)", yscale="log")
-    axes.set_xlim(time[0], max(time[-1], results.dt))
-    _legend(axes, results, note="line: RMS over runs and UAVs; shade: middle half")
+    axes.set(xlabel="time (s)", ylabel="position error (m)", xlim=_span(time, results.dt))
+    _log(axes.yaxis, axes.set_yscale)
+    axes.set_ylim(top=min(axes.get_ylim()[1], _farthest(results)))
+    _legend(figure, results)
     return figure
 
 
 def error_distribution(results: Results) -> Figure:
     """Share of all errors below a value."""
-    figure, axes = _figure(results, "Distribution of position errors")
-    share = np.concatenate(([0, 1e-3], np.linspace(0.005, 0.995, 397), [0.999, 1]))
-    for name, colour in _colours(results).items():
+    figure, axes = _figure(results, "Distribution of position errors", "all steps, UAVs and runs")
+    share = np.concatenate(([1e-3], np.linspace(0.005, 0.995, 397), [0.999, 1]))
+    for name, look in _looks(results).items():
         errors = results.agents[name].error[results.scored]
         if errors.size:
-            axes.plot(np.quantile(errors, share), 100 * share, color=colour)
+            axes.plot(np.quantile(errors, share), 100 * share, **look)
     _mark_bound(axes, results)
-    axes.set(xlabel="position error (m)", ylabel="share of errors below (%)", xscale="log")
-    axes.set_ylim(0, 100)
-    _legend(axes, results, note="all steps, UAVs and runs")
+    axes.set(xlabel="position error (m)", ylabel="share of errors below (%)", ylim=(0, 100))
+    _log(axes.xaxis, axes.set_xscale)
+    axes.set_xlim(right=min(axes.get_xlim()[1], _farthest(results)))
+    _legend(figure, results)
     return figure
 
 
 def error_boxes(results: Results) -> Figure:
     """RMSE of each UAV in each run: quartiles, 5 % to 95 % whiskers, every one as a dot."""
-    count = len(results.agents)
-    figure, axes = _figure(results, "RMSE of each UAV in each run", 1.6 + 0.45 * count)
+    count, limit = len(results.agents), _farthest(results)
+    note = "box: quartiles; whiskers: 5 % to 95 %; dots: every UAV and run; dashed: bound"
+    figure, axes = _figure(results, "RMSE of each UAV in each run", note, 1.7 + 0.5 * count)
     jitter = np.random.default_rng(0)
-    for row, (name, colour) in enumerate(_colours(results).items()):
+    for row, (name, look) in enumerate(_looks(results).items()):
         tracks = metrics.rmse_per_track(results.agents[name].error, results.scored)
-        tracks = tracks[np.isfinite(tracks)]
+        tracks, line = tracks[np.isfinite(tracks)], {"color": look["color"]}
+        if not tracks.size:
+            continue
         axes.boxplot(
-            [tracks],
+            [np.minimum(tracks, limit)],
             positions=[row],
             orientation="horizontal",
-            widths=0.5,
+            widths=0.55,
             whis=(5, 95),
             showfliers=False,
             patch_artist=True,
-            boxprops={"facecolor": (*colour, 0.25), "edgecolor": colour},
-            medianprops={"color": colour, "linewidth": 2},
-            whiskerprops={"color": colour},
-            capprops={"color": colour},
+            boxprops={"facecolor": (*look["color"], 0.2), "edgecolor": look["color"]},
+            medianprops=line | {"linewidth": 2},
+            whiskerprops=line,
+            capprops=line,
         )
         height = row + jitter.uniform(-0.2, 0.2, tracks.size)
-        axes.plot(tracks, height, ".", color=colour, markersize=3, alpha=0.5, markeredgewidth=0)
+        axes.plot(tracks, height, ".", **line, markersize=4, alpha=0.4, markeredgewidth=0)
+        middle = float(np.median(tracks))
+        if middle > limit:
+            label = f"median {middle:.3g} m →  "
+            axes.text(limit, row - 0.32, label, ha="right", fontsize=8, **line)
     _mark_bound(axes, results)
-    axes.set(xlabel="RMSE (m)", xscale="log")
+    axes.set(xlabel="RMSE (m)", ylim=(count - 0.5, -0.5))
+    _log(axes.xaxis, axes.set_xscale)
+    axes.set_xlim(right=min(axes.get_xlim()[1], limit))
     axes.set_yticks(range(count), list(results.agents))
-    axes.set_ylim(count - 0.5, -0.5)
     axes.grid(False, axis="y")
     return figure
 
 
 def consistency(results: Results) -> Figure:
     """Mean NEES at each step with the band in which a consistent estimator's lies."""
-    figure, axes = _figure(results, "Consistency: NEES over time")
-    time, dim = _time(results), results.scenario.arena.dim
-    for name, colour in _colours(results).items():
-        axes.plot(time, _mean_per_step(results.agents[name].nees, results), color=colour)
-    counts = results.scored.sum((0, 2))
-    bands = {n: metrics.nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts.tolist())}
-    low, high = np.array([bands[n] for n in counts.tolist()]).T
-    axes.fill_between(time, low, high, color=MUTED, alpha=0.3, linewidth=0)
+    dim = results.scenario.arena.dim
+    note = f"mean over runs and UAVs; {dim} is consistent (shade: 95 %), more is overconfident"
+    figure, axes = _figure(results, "Consistency: NEES over time", note)
+    time = _time(results)
+    for name, look in _looks(results).items():
+        look["linewidth"] *= 0.6
+        axes.plot(time, _mean_per_step(results.agents[name].nees, results.scored), **look)
+    counts = results.scored.sum((0, 2)).tolist()
+    bands = {n: metrics.nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts)}
+    low, high = np.array([bands[n] for n in counts]).T
+    axes.fill_between(time, low, high, color=MUTED, alpha=0.25, linewidth=0, zorder=0)
     axes.axhline(dim, color=INK, linewidth=0.8)
-    axes.set(xlabel="time (s)", ylabel="NEES of the position", yscale="log")
-    axes.set_xlim(time[0], max(time[-1], results.dt))
-    note = f"mean over runs and UAVs; {dim} is consistent, shade: 95 %; above: overconfident"
-    _legend(axes, results, bound=False, note=note)
+    axes.set(xlabel="time (s)", ylabel="NEES of the position", xlim=_span(time, results.dt))
+    _log(axes.yaxis, axes.set_yscale)
+    _legend(figure, results, bound=False)
     return figure
 
 
 def trajectories(results: Results) -> Figure:
-    """Truth and estimates of the first run's first UAVs: plan, and height over time."""
+    """Truth and estimates of the first run: plan, and height over time."""
     deep = results.scenario.arena.dim == 3
-    uavs = min(_SHOWN, results.scenario.arena.n_uavs)
-    whole = "" if uavs == results.scenario.arena.n_uavs else f", uav_0 to uav_{uavs - 1}"
     figure = Figure(figsize=(10.5 if deep else 6.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = np.atleast_1d(figure.subplots(1, 2 if deep else 1, width_ratios=[1.1, 1][: 1 + deep]))
-    time, truth = _time(results), _shown(results, results.truth[0])
-    tracks = {
-        name: (truth + results.agents[name].offset[0], colour)
-        for name, colour in _colours(results).items()
-    }
-    _track(panels[0], truth[..., 0], truth[..., 1], uavs, color=_TRUTH, linewidth=4)
-    for estimate, colour in tracks.values():
-        _track(panels[0], estimate[..., 0], estimate[..., 1], uavs, color=colour, linewidth=0.9)
-    panels[0].set(xlabel="x (m)", ylabel="y (m)", title=f"Seed {results.seed}{whole}: plan")
+    panels = np.atleast_1d(figure.subplots(1, 2 if deep else 1))
+    shown = results.scored[0][..., None]
+    truth = np.where(shown, results.truth[0], np.nan)
+    tracks = [(truth, _TRUTH)]
+    for name, look in _looks(results).items():
+        tracks.append((truth + results.agents[name].offset[0], look | {"linewidth": 1.0}))
+    title, time = f"Seed {results.seed}", np.broadcast_to(_time(results)[:, None], truth.shape[:2])
+    plan = slice(0, _IN_PLAN)
+    for position, look in tracks:
+        panels[0].plot(position[:, plan, 0], position[:, plan, 1], **look)
+    panels[0].set(xlabel="x (m)", ylabel="y (m)", title=f"{title}: plan{_which(results, _IN_PLAN)}")
     panels[0].set_aspect("equal", adjustable="box")
-    _limit(panels[0].set_xlim, truth[..., 0])
-    _limit(panels[0].set_ylim, truth[..., 1])
+    _limit(panels[0].set_xlim, truth[:, plan, 0])
+    _limit(panels[0].set_ylim, truth[:, plan, 1])
     if deep:
-        over = np.broadcast_to(time[:, None], truth.shape[:2])
-        _track(panels[1], over, truth[..., 2], uavs, color=_TRUTH, linewidth=4)
-        for estimate, colour in tracks.values():
-            _track(panels[1], over, estimate[..., 2], uavs, color=colour, linewidth=0.9)
-        panels[1].set(xlabel="time (s)", ylabel="z (m)", title="Height")
-        _limit(panels[1].set_ylim, truth[..., 2])
-        panels[1].set_xlim(time[0], max(time[-1], results.dt))
-    lines = [Line2D([], [], color=_TRUTH, linewidth=4, label="truth")]
-    lines += [Line2D([], [], color=c, label=name) for name, (_, c) in tracks.items()]
-    figure.legend(handles=lines, loc="outside lower center", ncols=min(4, len(lines)))
+        few = slice(0, _IN_HEIGHT)
+        for position, look in tracks:
+            panels[1].plot(time[:, few], position[:, few, 2], **look)
+        panels[1].set(xlabel="time (s)", ylabel="z (m)", xlim=_span(time[:, 0], results.dt))
+        panels[1].set_title(f"{title}: height{_which(results, _IN_HEIGHT)}")
+        _limit(panels[1].set_ylim, truth[:, few, 2])
+    handles = [Line2D([], [], label="truth", **_TRUTH)]
+    _legend(figure, results, handles, bound=False)
     return figure
 
 
 # ------------------------------------------------------------------ parts
 
-_BOUND = {"color": "black", "linestyle": (0, (5, 3)), "linewidth": 1.3}
-_TRUTH = "#c4cad6"
 
-
-def _figure(results: Results, title: str, height: float = 4.4) -> tuple[Figure, Axes]:
+def _figure(results: Results, title: str, note: str, height: float = 4.5) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(7.5, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    axes.set_title(f"{title} · {results.scenario.name}, {results.runs} runs", fontweight="bold")
+    axes.set_title(f"{title} · {results.scenario.name}, {results.runs} runs", pad=20)
+    axes.annotate(
+        note, (0, 1), (0, 6), "axes fraction", "offset points", fontsize=8.5, color=MUTED
+    )
     return figure, axes
 
 
-def _colours(results: Results) -> dict[str, tuple[float, ...]]:
-    """One colour per agent, the same in all figures."""
+def _looks(results: Results) -> dict[str, dict[str, Any]]:
+    """One colour per agent, the same in all figures; later lines are thinner, so that lines that
+    coincide can all be seen."""
     names = list(results.agents)
-    return dict(zip(names, map(tuple, uav_colours(len(names))), strict=True))
+    widths = np.linspace(2.8, 1.0, len(names)) if len(names) > 1 else [1.8]
+    colours = map(tuple, uav_colours(len(names)))
+    return {
+        name: {"color": colour, "linewidth": float(width)}
+        for name, colour, width in zip(names, colours, widths, strict=True)
+    }
 
 
-def _time(results: Results) -> Floats:
-    return np.arange(results.scenario.horizon) * results.dt
-
-
-def _legend(axes: Axes, results: Results, note: str, bound: bool = True) -> None:
-    """Agents and the bound below the axes, and what is shown."""
-    lines = [Line2D([], [], color=c, label=name) for name, c in _colours(results).items()]
+def _legend(
+    figure: Figure, results: Results, handles: Sequence[Line2D] = (), bound: bool = True
+) -> None:
+    """Agents, and the bound, below the axes."""
+    looks = _looks(results).items()
+    lines = [*handles, *(Line2D([], [], label=x, color=y["color"], lw=2) for x, y in looks)]
     if bound and results.bound is not None:
         lines.append(Line2D([], [], label="bound", **_BOUND))
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    figure.legend(handles=lines, loc="outside lower center", ncols=min(4, len(lines)))
-    axes.text(1, 1, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=8, color=MUTED)
+    letters = sum(len(str(line.get_label())) + 6 for line in lines)
+    columns = len(lines) if letters < 14 * figure.get_figwidth() else 3
+    figure.legend(handles=lines, loc="outside lower center", ncols=columns)
 
 
 def _mark_bound(axes: Axes, results: Results) -> None:
@@ -212,7 +229,37 @@ def _mark_bound(axes: Axes, results: Results) -> None:
         axes.axvline(results.bound.rmse, **_BOUND)
 
 
-def _quantiles_per_step(error: Floats, scored: np.ndarray, shares: tuple[float, ...]) -> Floats:
+def _log(axis: Any, set_scale: Callable[[str], None]) -> None:
+    """A logarithmic axis with plain numbers."""
+    set_scale("log")
+    low, high = sorted(axis.get_view_interval())
+    steps = (1, 2, 5) if high < 50 * low else (1, 3) if high < 3000 * low else (1,)
+    axis.set_major_locator(LogLocator(subs=steps, numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _farthest(results: Results) -> float:
+    """Errors beyond this (m) leave the figure: the arena's diagonal, or more if all are so bad."""
+    arena = results.scenario.arena
+    diagonal = float(np.linalg.norm(np.subtract(arena.high, arena.low)))
+    errors = [metrics.rmse(one.error, results.scored) for one in results.agents.values()]
+    return max(diagonal, 2 * min(errors)) if np.isfinite(errors).all() else diagonal
+
+
+def _time(results: Results) -> Floats:
+    return np.arange(results.scenario.horizon) * results.dt
+
+
+def _span(time: Floats, dt: float) -> tuple[float, float]:
+    return float(time[0]), max(float(time[-1]), dt)
+
+
+def _which(results: Results, shown: int) -> str:
+    return f", {shown} of {n} UAVs" if (n := results.scenario.arena.n_uavs) > shown else ""
+
+
+def _quantiles_per_step(error: Floats, scored: Flags, shares: tuple[float, ...]) -> Floats:
     """[shares, K], NaN where nothing is scored."""
     kept = np.where(scored, error, np.nan).swapaxes(0, 1).reshape(error.shape[1], -1)
     out = np.full((len(shares), len(kept)), np.nan)
@@ -221,22 +268,12 @@ def _quantiles_per_step(error: Floats, scored: np.ndarray, shares: tuple[float, 
     return out
 
 
-def _mean_per_step(values: Floats, results: Results) -> Floats:
+def _mean_per_step(values: Floats, scored: Flags) -> Floats:
     """[K], of what is scored and not NaN."""
-    counts = results.scored & ~np.isnan(values)
+    counts = scored & ~np.isnan(values)
     total = np.where(counts, values, 0.0).sum((0, 2), dtype=np.float64)
     number = counts.sum((0, 2))
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
-
-
-def _shown(results: Results, position: Floats) -> Floats:
-    """Positions with NaN, a gap in a line, where they are not scored."""
-    return np.where(results.scored[0][..., None], position, np.nan)
-
-
-def _track(axes: Axes, x: Floats, y: Floats, uavs: int, **style: object) -> None:
-    for i in range(uavs):
-        axes.plot(x[:, i], y[:, i], solid_capstyle="round", **style)
 
 
 def _limit(set_limits: Callable[[float, float], object], truth: Floats) -> None:

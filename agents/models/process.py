@@ -11,10 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.models import rotations
-from agents.models.rotations import rotate, rotate_by, rotation_between
 from coloc_env import scenario as believed_processes
-from coloc_env.geometry import cross_matrix, quaternion_exp
+from coloc_env.geometry import (
+    concat,
+    cross_matrix,
+    quaternion_exp,
+    quaternion_matrix,
+    rotate,
+    rotate_by,
+    rotation_between,
+    rotation_matrix,
+)
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import GRAVITY, Imu, Odometry
@@ -70,7 +77,7 @@ class Process(ABC):
 
     def rotation(self, x: Float[Tensor, "*s S"]) -> Float[Tensor, "*s d d"] | None:
         """Body-to-world matrix, None where attitude is no state."""
-        return rotations.matrix(self.attitude(x)) if self.attitude_size else None
+        return rotation_matrix(self.attitude(x)) if self.attitude_size else None
 
     def attitude(self, x: Float[Tensor, "*s S"]) -> Float[Tensor, "*s a"]:
         """The attitude's part of the state."""
@@ -88,7 +95,7 @@ class Process(ABC):
         linear = x[..., : 2 * d] + self._linear(delta)
         turned = rotate_by(x[..., 2 * d : 2 * d + a], delta[..., e])
         rest = x[..., 2 * d + a :] + delta[..., e.stop :]
-        return torch.cat((linear, turned, rest), -1)
+        return concat((linear, turned, rest))
 
     def boxminus(self, x: Float[Tensor, "*s S"], y: Float[Tensor, "*s S"]) -> Float[Tensor, "*s E"]:
         """``x ⊟ y``: the δ with ``y ⊞ δ = x``."""
@@ -99,7 +106,7 @@ class Process(ABC):
         e = self.attitude_error
         assert e is not None
         turn = rotation_between(y[..., 2 * d : 2 * d + a], x[..., 2 * d : 2 * d + a])
-        return torch.cat((difference[..., : e.start], turn, difference[..., 2 * d + a :]), -1)
+        return concat((difference[..., : e.start], turn, difference[..., 2 * d + a :]))
 
     def _linear(self, delta: Float[Tensor, "*s E"]) -> Float[Tensor, "*s 2d"]:
         return delta[..., : 2 * self.dim]
@@ -150,14 +157,14 @@ class InertialProcess(Process):
         dt = dt.unsqueeze(-1)
         a = rotate(q, u[..., :3]) - u.new_tensor((0.0, 0.0, GRAVITY))
         q = rotate_by(q, u[..., 3:] * dt)
-        return torch.cat((p + (v + 0.5 * a * dt) * dt, v + a * dt, q, biases), -1)
+        return concat((p + (v + 0.5 * a * dt) * dt, v + a * dt, q, biases))
 
     def linearize(
         self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 6"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s E E"], Float[Tensor, "*s E E"]]:
         if self.biased:
             u = u - x[..., 10:]
-        rotation = rotations.matrix(x[..., 6:10])
+        rotation = quaternion_matrix(x[..., 6:10])
         h = dt[..., None, None]
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
         f = torch.eye(self.error_size, dtype=x.dtype, device=x.device)
@@ -166,7 +173,7 @@ class InertialProcess(Process):
         f[..., :3, 3:6] = eye * h
         f[..., :3, 6:9] = 0.5 * turn * h
         f[..., 3:6, 6:9] = turn
-        f[..., 6:9, 6:9] = rotations.matrix(quaternion_exp(-u[..., 3:] * dt.unsqueeze(-1)))
+        f[..., 6:9, 6:9] = quaternion_matrix(quaternion_exp(-u[..., 3:] * dt.unsqueeze(-1)))
         accel, gyro = (self.imu.accel_std * h) ** 2, (self.imu.gyro_std * h) ** 2
         q = torch.zeros_like(f)
         q[..., :3, :3] = 0.25 * accel * h**2 * eye
@@ -217,13 +224,13 @@ class WheeledProcess(Process):
         velocity = rotate(x[..., 4:], u[..., :2])
         position = x[..., :2] + velocity * dt
         velocity = torch.where(dt > 0, velocity, x[..., 2:4])
-        return torch.cat((position, velocity, rotate_by(x[..., 4:], u[..., 2:] * dt)), -1)
+        return concat((position, velocity, rotate_by(x[..., 4:], u[..., 2:] * dt)))
 
     def linearize(
         self, x: Float[Tensor, "*s 5"], u: Float[Tensor, "*s 3"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s 3 3"], Float[Tensor, "*s 3 3"]]:
         h = dt[..., None]
-        rotation = rotations.matrix(x[..., 4:])
+        rotation = rotation_matrix(x[..., 4:])
         forward = (rotation @ u[..., :2, None])[..., 0] * h
         f = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 3, 3).clone()
         f[..., 0, 2], f[..., 1, 2] = -forward[..., 1], forward[..., 0]
@@ -235,7 +242,7 @@ class WheeledProcess(Process):
 
     def boxminus(self, x: Float[Tensor, "*s 5"], y: Float[Tensor, "*s 5"]) -> Float[Tensor, "*s 3"]:
         turn = rotation_between(y[..., 4:], x[..., 4:])
-        return torch.cat((x[..., :2] - y[..., :2], turn), -1)
+        return concat((x[..., :2] - y[..., :2], turn))
 
     def _linear(self, delta: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
         return torch.cat((delta[..., :2], torch.zeros_like(delta[..., :2])), -1)
@@ -284,7 +291,7 @@ class ConstantVelocityProcess(Process):
             p = p + first * noise[..., :d]
             rest = (vv - slope**2).clamp_min(0).sqrt()
             v = v + slope * noise[..., :d] + rest * noise[..., d:]
-        return torch.cat((p, v), -1)
+        return concat((p, v))
 
     def linearize(
         self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 0"], dt: Float[Tensor, "*s"]

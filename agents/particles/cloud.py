@@ -14,13 +14,18 @@ def effective_sample_size(log_weights: Float[Tensor, "*s M"]) -> Float[Tensor, "
     return torch.exp(-torch.logsumexp(2 * log_weights.log_softmax(-1), -1))
 
 
+def select(x: Float[Tensor, "B N M k"], index: Int64[Tensor, "B N m"]) -> Float[Tensor, "B N m k"]:
+    """Particles by index, in the memory order of ``geometry.join``."""
+    first = x.movedim(-1, 0)
+    return first.gather(-1, index.expand(len(first), *index.shape)).movedim(0, -1)
+
+
 def moments(
     process: Process, particles: Float32[Tensor, "B N M S"], weights: Float32[Tensor, "B N M"]
 ) -> tuple[Float32[Tensor, "B N S"], Float32[Tensor, "B N M E"]]:
     """Weighted mean, and every particle's error from it; a heavy particle anchors the mean of
     attitudes, whose tangents are averaged about it."""
-    heaviest = weights.argmax(-1)[..., None, None].expand(*weights.shape[:2], 1, particles.shape[-1])
-    anchor = particles.gather(2, heaviest)
+    anchor = select(particles, weights.argmax(-1, keepdim=True))
     apart = process.boxminus(particles, anchor)
     shift = (weights.unsqueeze(-2) @ apart)[..., 0, :]
     mean = process.boxplus(anchor[..., 0, :], shift)
@@ -59,5 +64,5 @@ def liu_west(
     factor = torch.linalg.cholesky_ex(
         (shrink**2 * covariance + torch.diag(floor**2)).double()
     ).L.to(noise.dtype)
-    moved = math.sqrt(1 - shrink**2) * apart + noise @ factor.mT
+    moved = math.sqrt(1 - shrink**2) * apart + (factor @ noise.mT).mT
     return process.boxplus(mean.unsqueeze(-2), moved)

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.models import rotations
 from agents.models.measurements import (
     Block,
     LandmarkVectors,
@@ -42,18 +41,18 @@ def landmark_log_likelihood(
         raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
     count, sum_z = visible.sum((-2, -1)), z.sum(-2)
     p = particles[..., :d] - centre[..., None, :d]
-    turn = rotations.matrix_difference(
-        process.attitude(particles), process.attitude(centre).unsqueeze(-2)
-    )
+    rotation = process.rotation(particles)
+    assert rotation is not None
+    turn = rotation.flatten(-2) - at.flatten(-2).unsqueeze(-2)
     # ΔR enters through ΔR Σz and tr(ΔR Σ z Lᵀ): one product with a [d², d + 1] matrix.
     by_row = torch.zeros(*sum_z.shape[:-1], d, d, d + 1, device=z.device)
     for row in range(d):
         by_row[..., row, :, row] = sum_z
     by_row[..., d] = points.mT @ z
-    turned = turn @ by_row.flatten(-3, -2)
+    turned = (by_row.flatten(-3, -2).mT @ turn.mT).mT
     fixed = points.sum(-2) - (at @ sum_z.unsqueeze(-1))[..., 0]
-    along = (p * (count[..., None, None] * p + 2 * (turned[..., :d] - fixed.unsqueeze(-2)))).sum(-1)
-    return (along - 2 * turned[..., d]) * (-0.5 / model.std**2)
+    along = p * (count[..., None, None] * p + 2 * (turned[..., :d] - fixed.unsqueeze(-2)))
+    return (sum(along.unbind(-1)) - 2 * turned[..., d]) * (-0.5 / model.std**2)
 
 
 def range_log_likelihood(
