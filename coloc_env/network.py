@@ -51,14 +51,13 @@ class Network:
         n = position.shape[2]
         if self.dense(n):
             index = torch.arange(n, device=position.device).expand(1, 1, n, n)
-            apart = position.unsqueeze(2) - position.unsqueeze(3)
-            reach = (alive.unsqueeze(2) & alive.unsqueeze(3)) & ~torch.eye(
-                n, dtype=torch.bool, device=position.device
-            )
+            reach = alive.unsqueeze(2) & alive.unsqueeze(3)
+            reach.diagonal(dim1=-2, dim2=-1).fill_(False)
             if self.radius is not None:
-                reach = reach & (squared_norm(apart) <= self.radius**2)
+                apart = position.unsqueeze(2) - position.unsqueeze(3)
+                reach &= squared_norm(apart) <= self.radius**2
             if self.walls:
-                reach = reach & ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
+                reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
             return index, reach
         return self._nearest(position, alive)
 

@@ -1,7 +1,7 @@
 """The PettingZoo face: one world, numpy in and out."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -9,13 +9,17 @@ import torch
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
-from coloc_env.observation import action_space, observation_space, state_space
+from coloc_env.observation import action_space, all_leaves, observation_space, state_space
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
+from coloc_env.sense import Sensed
 from coloc_env.world import World
 
 RENDER_MODES = ("human", "rgb_array")
+INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
+
+T = TypeVar("T")
 
 
 class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
@@ -48,13 +52,15 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
         space, actions = observation_space(scenario), action_space(scenario)
-        self.observation_spaces = {agent: space for agent in self.possible_agents}
-        self.action_spaces = {agent: actions for agent in self.possible_agents}
+        self.observation_spaces = dict.fromkeys(self.possible_agents, space)
+        self.action_spaces = dict.fromkeys(self.possible_agents, actions)
         self.state_space = state_space(scenario)
         self._width = actions.shape[0]
         self._next_seed: int | None = None
-        self._rows: list[list[dict[str, np.ndarray]]] = []
-        self._renderer: Renderer | None = None
+        self._names = tuple(all_leaves(scenario))
+        self._can_fail = bool(scenario.failure_rate or scenario.failures)
+        self._window: Sensed | None = None
+        self._renderer = None if render_mode is None else Renderer(scenario)
 
     def observation_space(self, agent: str) -> gym.spaces.Dict:
         """The same space object for every agent and call."""
@@ -74,17 +80,11 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._next_seed = seed + 1
         self.agents = list(self.possible_agents)
         self.world.reset([seed])
-        n = len(self.agents)
-        self._count, self._sum, self._squares, self._largest = np.zeros((4, n))
-        self._static = [
-            {name: leaf[0, i].numpy().copy() for name, leaf in self.world.static.items()}
-            for i in range(len(self.agents))
-        ]
-        self._sensed = None
-        if self.render_mode is not None:
-            self._renderer = Renderer(self.scenario)
-        infos = self._infos(self.agents, np.zeros(n), np.zeros(n))
-        return self._observe(self.agents), infos
+        self._tally = _Tally(len(self.agents))
+        self._static = [list(leaf[0].numpy().copy()) for leaf in self.world.static.values()]
+        if self._renderer is not None:
+            self._renderer.reset()
+        return self._observe(self.agents), self._of(self.agents, self._tally.infos())
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -106,17 +106,20 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         step = world.step(estimates)
-        infos = self._infos(acting, step.error[0].numpy(), step.scored[0].numpy())
+        self._tally.add(step.error[0].numpy(), step.scored[0].numpy())
+        infos = self._of(acting, self._tally.infos())
         observations = self._observe(acting)
-        rewards, failed = step.reward[0].tolist(), step.terminated[0].tolist()
-        over, index = bool(step.truncated), self._index
-        terminated = {a: failed[index[a]] for a in acting}
-        truncated = {a: over and not terminated[a] for a in acting}
+        rewards, over = step.reward[0].tolist(), bool(step.truncated)
+        terminated = dict.fromkeys(acting, False)
+        truncated = dict.fromkeys(acting, over)
+        for i in step.terminated[0].nonzero()[:, 0].tolist() if self._can_fail else ():
+            failed = self.possible_agents[i]
+            terminated[failed], truncated[failed] = True, False
         if over:
             self.agents = []
-        elif any(failed):
+        elif self._can_fail:
             self.agents = [a for a in acting if not terminated[a]]
-        return observations, {a: rewards[index[a]] for a in acting}, terminated, truncated, infos
+        return observations, self._of(acting, rewards), terminated, truncated, infos
 
     def state(self) -> np.ndarray:
         """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
@@ -150,9 +153,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         except (TypeError, ValueError):
             fits = False
         if not fits:
-            wrong = next(
-                (a for a in agents if np.shape(actions[a]) != (self._width,)), agents[0]
-            )
+            wrong = next((a for a in agents if np.shape(actions[a]) != (self._width,)), agents[0])
             raise ValueError(
                 f"{name}: the action of {wrong} has shape {np.shape(actions[wrong])}; "
                 f"({self._width},) is needed: [position, velocity, log-std]"
@@ -168,38 +169,46 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             stacked = every
         return torch.from_numpy(stacked).unsqueeze(0)
 
+    def _of(self, agents: list[str], every: list[T]) -> dict[str, T]:
+        """The entries of some agents from a list of all."""
+        if len(agents) == len(every):
+            return dict(zip(agents, every, strict=True))
+        return {agent: every[self._index[agent]] for agent in agents}
+
     def _observe(self, agents: list[str]) -> dict[str, dict[str, np.ndarray]]:
         """Each agent's leaves: views of a window that the world never writes to again."""
         world = self.world
-        if world.sensed is not self._sensed:
-            self._sensed = world.sensed
-            self._leaves = {name: leaf[0].numpy() for name, leaf in world.sensed.leaves.items()}
+        if world.sensed is not self._window:
+            self._window = world.sensed
+            self._leaves = [leaf[0].numpy() for leaf in world.sensed.leaves.values()]
         messages, mask = world.messages()
-        now = [leaf[world.cursor] for leaf in self._leaves.values()]
-        rows = zip(*now, messages[0].numpy(), mask[0].numpy(), strict=True)
-        names = (*self._leaves, "messages", "message_mask")
-        every = [
-            dict(zip(names, row, strict=True)) | static
-            for row, static in zip(rows, self._static, strict=True)
-        ]
-        return {a: every[self._index[a]] for a in agents}
+        now = [leaf[world.cursor] for leaf in self._leaves]
+        rows = zip(*now, messages[0].numpy(), mask[0].numpy(), *self._static, strict=True)
+        return self._of(agents, [dict(zip(self._names, row, strict=True)) for row in rows])
 
-    def _infos(
-        self, agents: list[str], error: np.ndarray, scored: np.ndarray
-    ) -> dict[str, dict[str, float]]:
-        self._count += scored
+
+class _Tally:
+    """The errors of an episode so far, UAV by UAV: what infos tell."""
+
+    def __init__(self, n_uavs: int) -> None:
+        self._error, self._scored = np.zeros((2, n_uavs))
+        self._count, self._sum, self._squares, self._largest = np.zeros((4, n_uavs))
+
+    def add(self, error: np.ndarray, scored: np.ndarray) -> None:
+        """Errors [N] in m of one step, 0 where they are not scored."""
+        self._error, self._scored = error, scored.astype(np.float64)
+        self._count += self._scored
         self._sum += error
         self._squares += error * error
         np.maximum(self._largest, error, out=self._largest)
+
+    def infos(self) -> list[dict[str, float]]:
+        """One info a UAV, keys ``INFO_KEYS``."""
         count = np.maximum(self._count, 1)
-        columns = np.array(
-            (error, scored, np.sqrt(self._squares / count), self._sum / count, self._largest)
-        )
-        every = [dict(zip(INFO_KEYS, column, strict=True)) for column in columns.T.tolist()]
-        return {a: every[self._index[a]] for a in agents}
-
-
-INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
+        rmse, mean = np.sqrt(self._squares / count), self._sum / count
+        columns = (self._error, self._scored, rmse, mean, self._largest)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        return [dict(zip(INFO_KEYS, row, strict=True)) for row in rows]
 
 
 def parallel_env(

@@ -200,5 +200,7 @@ def draw_prior(
         position_std = torch.full_like(position, prior.position_std)
     velocity = truth.velocity + prior.velocity_std * draws[..., dim : 2 * dim]
     attitude = rotate_by(truth.attitude, prior.attitude_std * draws[..., 2 * dim :])
-    rest = position.new_tensor((prior.velocity_std, prior.attitude_std)).expand(*position.shape[:2], 2)
+    rest = position.new_tensor((prior.velocity_std, prior.attitude_std)).expand(
+        *position.shape[:2], 2
+    )
     return torch.cat((position, velocity, attitude, position_std, rest), -1).to(torch.float32)

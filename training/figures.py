@@ -17,7 +17,7 @@ from training import metrics
 from training.metrics import Flags, Floats
 from training.results import FIGURES, Results
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": MUTED,
     "axes.grid": True,
@@ -150,6 +150,7 @@ def consistency(results: Results) -> Figure:
     axes.axhline(dim, color=INK, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="NEES of the position", xlim=_span(time, results.dt))
     _log(axes.yaxis, axes.set_yscale)
+    axes.set_ylim(top=min(axes.get_ylim()[1], 1000 * dim))
     _legend(figure, results, bound=False)
     return figure
 
@@ -159,7 +160,7 @@ def trajectories(results: Results) -> Figure:
     deep = results.scenario.arena.dim == 3
     figure = Figure(figsize=(10.5 if deep else 6.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = np.atleast_1d(figure.subplots(1, 2 if deep else 1))
+    panels = figure.subplots(1, 2 if deep else 1, squeeze=False)[0]
     shown = results.scored[0][..., None]
     truth = np.where(shown, results.truth[0], np.nan)
     tracks = [(truth, _TRUTH)]
@@ -193,9 +194,7 @@ def _figure(results: Results, title: str, note: str, height: float = 4.5) -> tup
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_title(f"{title} · {results.scenario.name}, {results.runs} runs", pad=20)
-    axes.annotate(
-        note, (0, 1), (0, 6), "axes fraction", "offset points", fontsize=8.5, color=MUTED
-    )
+    axes.annotate(note, (0, 1), (0, 6), "axes fraction", "offset points", fontsize=8.5, color=MUTED)
     return figure, axes
 
 
@@ -203,7 +202,7 @@ def _looks(results: Results) -> dict[str, dict[str, Any]]:
     """One colour per agent, the same in all figures; later lines are thinner, so that lines that
     coincide can all be seen."""
     names = list(results.agents)
-    widths = np.linspace(2.8, 1.0, len(names)) if len(names) > 1 else [1.8]
+    widths = np.linspace(2.4, 1.2, len(names)) if len(names) > 1 else [1.8]
     colours = map(tuple, uav_colours(len(names)))
     return {
         name: {"color": colour, "linewidth": float(width)}

@@ -1,4 +1,4 @@
-"""Results of an evaluation: the figures of ``results.json``, as tables, and as a folder of files."""
+"""Results of an evaluation: the figures of ``results.json``, tables, and a folder of files."""
 
 import csv
 import io
@@ -31,6 +31,12 @@ COLUMNS = {
     "ms_per_step": "ms/step",
     "ratio_to_bound": "× bound",
 }
+
+_EXPLAINED = """\
+Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs; max is the
+mean over runs and UAVs of the largest error. A run counts as diverged if a UAV's error stays above
+{:g} m over its last {:g} s, or if an estimate was not finite; it stays in every figure. NEES: {}
+is consistent, more is overconfident. ms/step: the whole team, one world, one thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +98,8 @@ class Results:
 
     def paired_difference(self, a: str, b: str) -> Difference:
         """RMSE of agent ``a`` minus that of ``b``, run by run: mean and 95 % interval, m."""
-        return metrics.paired_difference(
-            *(metrics.rmse_per_run(self.agents[x].error, self.scored) for x in (a, b))
-        )
+        first, second = (metrics.rmse_per_run(self.agents[x].error, self.scored) for x in (a, b))
+        return metrics.paired_difference(first, second)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -197,21 +202,15 @@ def markdown(results: Results) -> str:
         chosen = (f"`{key}={value}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
     text += _table(["agent", *COLUMNS.values()], rows(results))
-    text += [
-        "",
-        f"Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs; max is "
-        f"the mean over runs and UAVs of the largest error. A run counts as diverged if a UAV's error "
-        f"stays above {results.lost_beyond:g} m over its last {metrics.LOST_SECONDS:g} s, or if an "
-        f"estimate was not finite; it stays in every figure. NEES: {dim} is consistent, more is "
-        "overconfident. ms/step: the whole team, one world, one thread.",
-    ]
+    text += ["", _EXPLAINED.format(results.lost_beyond, metrics.LOST_SECONDS, dim)]
     if len(names) > 1 and results.runs > 1:
         differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
         text += _table(["agent", "mean difference", "95 % interval"], differences)
-    failed = [(name, one) for name, one in results.agents.items() if one.raised]
-    for name, one in failed:
-        text += ["", f"`{name}` raised in {one.raised} of {results.runs} runs, first: {one.message}"]
+    for name, one in results.agents.items():
+        if one.raised:
+            how_many = f"{one.raised} of {results.runs} runs"
+            text += ["", f"`{name}` raised in {how_many}; the first at {one.message}"]
     return "\n".join(text) + "\n"
 
 

@@ -27,7 +27,9 @@ def staged_folder(out: Path, names: Sequence[str]) -> Iterator[Path]:
                 f"{out} holds {foreign[0]!r} but no {names[-1]}: it would be overwritten; "
                 "give another folder"
             )
-    with _made(out if out.exists() else out.parent, f".{out.name}.partial-{os.getpid()}") as partial:
+    with _made(
+        out if out.exists() else out.parent, f".{out.name}.partial-{os.getpid()}"
+    ) as partial:
         partial.mkdir()
         new = partial / "new"
         new.mkdir()

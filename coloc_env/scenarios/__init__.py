@@ -1,6 +1,7 @@
 """Scenario families, one short file each; importing this package registers them all."""
 
 from coloc_env.scenarios import indoor as _indoor  # noqa: F401
+from coloc_env.scenarios import replay as _replay  # noqa: F401
 from coloc_env.scenarios.registry import (
     FAMILIES,
     make_scenario,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Arena, Kinematics
+from coloc_env.tape import Tape
 
 MASK = (0.0, 1.0)
 
@@ -101,7 +102,7 @@ class Recorded(Sensor):
     """
 
     sensor: Sensor
-    tape: dict[str, Tensor]
+    tape: dict[str, Tape]
     maps: dict[str, Tensor] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
@@ -120,10 +121,7 @@ class Recorded(Sensor):
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         alive = window.alive.unsqueeze(-1)
-        return {
-            name: samples.to(window.steps.device)[window.steps] * alive
-            for name, samples in self.tape.items()
-        }
+        return {name: tape.at(window.steps) * alive for name, tape in self.tape.items()}
 
 
 def require(condition: bool, owner: Any, name: str, allowed: str) -> None:

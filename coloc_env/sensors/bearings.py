@@ -40,7 +40,9 @@ class LandmarkBearings(Sensor):
     depth: int = 1
 
     def __post_init__(self) -> None:
-        require(self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)")
+        require(
+            self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)"
+        )
         require(0 <= self.share <= 1, self, "share", "a probability in [0, 1]")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:

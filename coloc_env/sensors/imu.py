@@ -51,9 +51,10 @@ class Imu(Sensor):
         gravity = now.velocity.new_tensor((0.0, 0.0, GRAVITY))
         force = unrotate(before.attitude, (now.velocity - before.velocity) / dt + gravity)
         rate = rotation_between(before.attitude, now.attitude) / dt
-        imu = noise.normal(window.keys, "imu", 6 * window.layout.arena.n_uavs).unflatten(-1, (-1, 6))
-        imu[..., :3].mul_(self.accel_std).add_(force)
-        imu[..., 3:].mul_(self.gyro_std).add_(rate)
+        clean = torch.cat((force, rate), -1).to(torch.float32)
+        white = noise.normal(window.keys, "imu", clean.shape[-2] * 6).unflatten(-1, (-1, 6))
+        std = clean.new_tensor([self.accel_std] * 3 + [self.gyro_std] * 3)
+        imu = white.mul_(std).add_(clean)
         if "bias" in placed:
             imu.add_(placed["bias"].unsqueeze(1))
         return {"imu": imu.mul_(window.alive.unsqueeze(-1))}

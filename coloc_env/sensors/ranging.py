@@ -119,7 +119,9 @@ class AnchorRanging(Sensor):
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         anchors = torch.tensor(self.anchors, dtype=torch.float64, device=keys.device)
-        require(anchors.shape[1] == layout.arena.dim, self, "anchors", "positions of the room's dim")
+        require(
+            anchors.shape[1] == layout.arena.dim, self, "anchors", "positions of the room's dim"
+        )
         return {"anchors": anchors.expand(len(keys), -1, -1)}
 
     def map_values(self, placed: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from coloc_env.geometry import rotation_matrix, wrap_angle
+from coloc_env.tape import Tape
 from coloc_env.motion import (
     Circle,
     FigureEight,
@@ -152,7 +153,7 @@ def test_formations_change_shape_without_collisions(n, fly, arena):
 def test_recorded_motion_replays_its_tape_and_then_stays(fly, arena):
     room = arena(*ROOM)
     tape = fly(Circle(), room, [0], 50)
-    motion = Recorded(tape.position[0], tape.velocity[0], tape.attitude[0])
+    motion = Recorded(Tape(tape.position[0]), Tape(tape.velocity[0]), Tape(tape.attitude[0]))
     replay = fly(motion, room, [1, 2], 60, window=7, first=[0, 20])
     assert torch.equal(replay.position[0, :50], tape.position[0])
     assert torch.equal(replay.velocity[1, :30], tape.velocity[0, 20:])
@@ -161,6 +162,7 @@ def test_recorded_motion_replays_its_tape_and_then_stays(fly, arena):
         ValueError, match=r"Recorded: position must be float64 of shape \(50, 5, 3\)"
     ):
         fly(motion, arena(*ROOM, n=5), [0], 1)
-    single = Recorded(tape.position[0], tape.velocity[0].float(), tape.attitude[0])
+    halved = Tape(tape.velocity[0].float())
+    single = Recorded(Tape(tape.position[0]), halved, Tape(tape.attitude[0]))
     with pytest.raises(ValueError, match="Recorded: velocity must be float64"):
         fly(single, room, [0], 1)

@@ -1,0 +1,178 @@
+"""Recordings on a scenario's steps: truth interpolated, measurements only where they arrived.
+
+Step k is at ``start + k dt``. Nothing measured is interpolated or invented: a step delivers what
+arrived in (t_{k−1}, t_k]; what drives a motion model (IMU, odometry) is integrated over that
+interval exactly, each sample held until the next.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_env.datasets.files import DataError
+from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table, Track
+
+_TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this close to it
+
+
+@dataclass(frozen=True)
+class Grid:
+    """T step times, int64 ns on the recording's clock, ``dt`` s apart."""
+
+    start: int
+    dt: float
+    count: int
+
+    @property
+    def times(self) -> Stamps:
+        return self.start + np.round(np.arange(self.count) * self.dt * 1e9).astype(np.int64)
+
+    def step_of(self, time: Stamps) -> NDArray[np.int64]:
+        """The step that delivers a measurement of each time; −1 or T for times outside."""
+        step = np.searchsorted(self.times, time, side="left")
+        return np.where(time < self.start - round(self.dt * 1e9), -1, step)
+
+
+def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Grid:
+    """Steps over the longest span in which all robots have truth and every driving stream."""
+    spans = [(t.time[0], t.time[-1]) for t in recording.truth]
+    for name in drivers:
+        if name not in recording.streams:
+            raise DataError(f"{recording.name} has no {name} stream, which this scenario needs")
+        spans += [(t.time[0], t.time[-1]) for t in recording.streams[name]]
+    start, end = max(s for s, _ in spans), min(e for _, e in spans)
+    count = int((end - start) // round(dt * 1e9)) + 1
+    if count < 2:
+        raise DataError(f"{recording.name}: its streams overlap for less than one step of {dt} s")
+    return Grid(int(start), dt, count)
+
+
+def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
+    """Position, velocity, attitude [T, …] at the steps, and where truth was close enough."""
+    times = grid.times
+    position = _interpolate(times, track.time, track.position)
+    attitude = _interpolate(times, track.time, track.attitude)
+    if attitude.shape[1] == 4:
+        attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    else:
+        attitude = (attitude + np.pi) % (2 * np.pi) - np.pi
+    if track.velocity is not None:
+        velocity = _interpolate(times, track.time, track.velocity)
+    else:
+        half = round(grid.dt * 0.5e9)
+        ahead, behind = (
+            _interpolate(times + by, track.time, track.position) for by in (half, -half)
+        )
+        velocity = (ahead - behind) / grid.dt
+    after = np.searchsorted(track.time, times).clip(1, len(track.time) - 1)
+    gap = np.minimum(abs(track.time[after] - times), abs(times - track.time[after - 1]))
+    return position, velocity, attitude, gap <= _TRUTH_WITHIN
+
+
+def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
+    """What a stream says over each step: samples [T, S, F] and for how long each holds [T, S] (s).
+
+    Sample i holds from its time to the next one's; step k covers (t_{k−1}, t_k], step 0 nothing.
+    """
+    times, _ = grid.times, table.time
+    cuts = np.union1d(times, table.time[(table.time > times[0]) & (table.time < times[-1])])
+    length = np.diff(cuts) * 1e-9
+    source = (np.searchsorted(table.time, cuts[:-1], side="right") - 1).clip(0)
+    step = np.searchsorted(times, cuts[:-1], side="right")
+    first = np.searchsorted(step, np.arange(grid.count))
+    slot = np.arange(len(step)) - first[step]
+    samples = np.zeros((grid.count, slot.max() + 1, table.values.shape[1]))
+    durations = np.zeros(samples.shape[:2])
+    samples[step, slot], durations[step, slot] = table.values[source], length
+    return samples, durations
+
+
+def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:
+    """``imu`` leaf [T, 6]: increments of velocity and attitude over each step, divided by dt, in
+    the body frame at the step's start (pre-integration; Forster et al. 2017, eqs. 33-36).
+
+    ``gyro_bias`` (rad/s) is taken off first, so that the rotation within a step is right.
+    """
+    samples, durations = held_intervals(grid, table)
+    turn = np.tile((1.0, 0.0, 0.0, 0.0), (grid.count, 1))
+    gained = np.zeros((grid.count, 3))
+    for slot in range(samples.shape[1]):
+        h = durations[:, slot, None]
+        rate = (samples[:, slot, :3] - gyro_bias) * h
+        middle = _product(turn, _exp(0.5 * rate))
+        gained += _rotate(middle, samples[:, slot, 3:]) * h
+        turn = _product(turn, _exp(rate))
+    out = np.concatenate((gained, _log(turn)), 1) / grid.dt
+    out[0] = out[1]
+    return out
+
+
+def odometry_on(grid: Grid, table: Table) -> Floats:
+    """``odometry`` leaf [T, 3]: displacement forward and left and turn over each step, over dt."""
+    samples, durations = held_intervals(grid, table)
+    moved, heading = np.zeros((grid.count, 2)), np.zeros(grid.count)
+    for slot in range(samples.shape[1]):
+        h = durations[:, slot]
+        speed, turn = samples[:, slot, 0] * h, samples[:, slot, 1] * h
+        middle = heading + 0.5 * turn
+        chord = speed * np.sinc(0.5 * turn / np.pi)
+        moved += np.stack((np.cos(middle), np.sin(middle)), 1) * chord[:, None]
+        heading += turn
+    return np.concatenate((moved, heading[:, None]), 1) / grid.dt
+
+
+def slots_on(
+    grid: Grid, table: Table, slot: NDArray[np.int64], count: int, columns: slice
+) -> tuple[Floats, Flags]:
+    """Measurements [T, D, count, F] by slot, D as deep as one step ever delivers the same slot,
+    and which are there [T, D, count]."""
+    step = grid.step_of(table.time)
+    inside = (step >= 0) & (step < grid.count)
+    step, slot, values = step[inside], slot[inside], table.values[inside, columns]
+    order = np.lexsort((np.arange(len(step)), slot, step))
+    step, slot, values = step[order], slot[order], values[order]
+    key = step * count + slot
+    depth = np.arange(len(key)) - np.searchsorted(key, key)
+    shape = (grid.count, int(depth.max(initial=0)) + 1, count)
+    out, there = np.zeros((*shape, values.shape[1])), np.zeros(shape, dtype=bool)
+    out[step, depth, slot], there[step, depth, slot] = values, True
+    return out, there
+
+
+def last_on(grid: Grid, table: Table) -> tuple[Floats, Flags]:
+    """The newest sample [T, F] of each step, and where one came [T]."""
+    step = grid.step_of(table.time)
+    inside = (step >= 0) & (step < grid.count)
+    out = np.zeros((grid.count, table.values.shape[1]))
+    there = np.zeros(grid.count, dtype=bool)
+    out[step[inside]], there[step[inside]] = table.values[inside], True
+    return out, there
+
+
+def _interpolate(at: Stamps, time: Stamps, values: Floats) -> Floats:
+    zero = time[0]
+    x, xp = (at - zero) * 1e-9, (time - zero) * 1e-9
+    return np.stack([np.interp(x, xp, column) for column in values.T], 1)
+
+
+def _product(a: Floats, b: Floats) -> Floats:
+    w = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], 1, keepdims=True)
+    v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+    return np.concatenate((w, v), 1)
+
+
+def _rotate(q: Floats, v: Floats) -> Floats:
+    t = 2 * np.cross(q[:, 1:], v)
+    return v + q[:, :1] * t + np.cross(q[:, 1:], t)
+
+
+def _exp(v: Floats) -> Floats:
+    angle = np.linalg.norm(v, axis=1, keepdims=True)
+    return np.concatenate((np.cos(angle / 2), 0.5 * np.sinc(angle / 2 / np.pi) * v), 1)
+
+
+def _log(q: Floats) -> Floats:
+    sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[:, :1])
+    return np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0) * q[:, 1:]

@@ -1,0 +1,167 @@
+"""From a Recording to what a scenario needs: its motion, and its sensors as tapes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from coloc_env.datasets.files import DataError
+from coloc_env.datasets.grid import Grid, imu_on, last_on, odometry_on, slots_on, truth_on
+from coloc_env.datasets.recording import Floats, Recording, Table
+from coloc_env.motion import Arena, Recorded
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Imu,
+    LandmarkBearings,
+    Odometry,
+    Ranging,
+    UavBearings,
+)
+from coloc_env.sensors import Recorded as RecordedSensor
+from coloc_env.tape import Tape
+
+
+def recorded_motion(recording: Recording, grid: Grid) -> Recorded:
+    """The team's truth on the grid; steps without truth within 50 ms are not valid."""
+    tracks = [truth_on(grid, track) for track in recording.truth]
+    position, velocity, attitude, valid = (
+        Tape(torch.from_numpy(np.stack(parts, 1))) for parts in zip(*tracks, strict=True)
+    )
+    return Recorded(position, velocity, attitude, valid)
+
+
+def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
+    """The box around everything there is, ``margin`` m wider."""
+    points = [track.position for track in recording.truth]
+    points += [p for p in (recording.landmarks, recording.anchors) if len(p)]
+    everything = np.concatenate(points)
+    low, high = everything.min(0) - margin, everything.max(0) + margin
+    return Arena(
+        recording.dim,
+        len(recording.robots),
+        grid.dt,
+        tuple(low.round(2).tolist()),
+        tuple(high.round(2).tolist()),
+    )
+
+
+def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) -> RecordedSensor:
+    """Leaf ``imu`` with a calibrated bias (gyro rad/s, accel m/s²; [N, 6]) taken off."""
+    tapes = []
+    for table, own in zip(recording.streams["imu"], bias, strict=True):
+        leaf = imu_on(grid, table, own[:3])
+        leaf[:, :3] -= own[3:]
+        tapes.append(leaf)
+    return RecordedSensor(sensor, {"imu": _tape(tapes)})
+
+
+def recorded_odometry(
+    recording: Recording, grid: Grid, sensor: Odometry, delay: float, scale: float
+) -> RecordedSensor:
+    """Leaf ``odometry``: commands taken to act ``delay`` s later, ``scale`` times as strongly."""
+    tapes = []
+    for table in recording.streams["odometry"]:
+        acting = Table(table.time + round(delay * 1e9), scale * table.values, table.columns)
+        tapes.append(odometry_on(grid, acting))
+    return RecordedSensor(sensor, {"odometry": _tape(tapes)})
+
+
+def recorded_bearings(
+    recording: Recording, grid: Grid, sensor: LandmarkBearings | UavBearings
+) -> tuple[RecordedSensor, int]:
+    """Leaves of range and bearing to landmarks or robots, and the depth that they need."""
+    to_landmarks = isinstance(sensor, LandmarkBearings)
+    stream = "landmark_bearings" if to_landmarks else "uav_bearings"
+    name = "landmark_bearing" if to_landmarks else "uav_bearing"
+    count = len(recording.landmarks) if to_landmarks else len(recording.robots)
+    values, there = [], []
+    for table in recording.streams[stream]:
+        seen, mask = slots_on(grid, table, table.values[:, 0].astype(np.int64), count, slice(1, 3))
+        values.append(seen)
+        there.append(mask)
+    depth = max(mask.shape[1] for mask in there)
+    pad = [((0, 0), (0, depth - mask.shape[1]), (0, 0)) for mask in there]
+    values = [np.pad(v, (*p, (0, 0))) for v, p in zip(values, pad, strict=True)]
+    there = [np.pad(m, p) for m, p in zip(there, pad, strict=True)]
+    tape = {
+        f"{name}s": _tape([v.reshape(grid.count, -1) for v in values]),
+        f"{name}_mask": _tape([m.reshape(grid.count, -1) for m in there]),
+    }
+    maps = {}
+    if to_landmarks:
+        maps["landmark_map"] = torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)
+    return RecordedSensor(sensor, tape, maps), depth
+
+
+def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> RecordedSensor:
+    """Leaves ``ranges`` and ``range_mask``: entry (robot · T + own tag) · T + their tag."""
+    tags, robots = sensor.n_tags, len(recording.robots)
+    slots = [
+        ((t.values[:, 1] * tags + t.values[:, 0]) * tags + t.values[:, 2]).astype(np.int64)
+        for t in recording.streams["uav_ranges"]
+    ]
+    tape = _ranges(recording, grid, "uav_ranges", slots, robots * tags**2, slice(3, 4))
+    return RecordedSensor(sensor, {"ranges": tape[0], "range_mask": tape[1]})
+
+
+def recorded_anchor_ranges(
+    recording: Recording, grid: Grid, sensor: AnchorRanging
+) -> RecordedSensor:
+    """Leaves ``anchor_ranges`` and ``anchor_range_mask``: entry own tag · A + anchor."""
+    anchors = len(recording.anchors)
+    slots = [
+        (t.values[:, 0] * anchors + t.values[:, 1]).astype(np.int64)
+        for t in recording.streams["anchor_ranges"]
+    ]
+    count = anchors * sensor.n_tags
+    tape = _ranges(recording, grid, "anchor_ranges", slots, count, slice(2, 3))
+    maps = {"anchor_map": torch.from_numpy(recording.anchors.ravel()).to(torch.float32)}
+    return RecordedSensor(sensor, {"anchor_ranges": tape[0], "anchor_range_mask": tape[1]}, maps)
+
+
+def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> RecordedSensor:
+    """Leaves ``height`` and ``height_mask``: the newest sample of each step."""
+    tables = [last_on(grid, table) for table in recording.streams["height"]]
+    return RecordedSensor(
+        sensor,
+        {
+            "height": _tape([values for values, _ in tables]),
+            "height_mask": _tape([there[:, None] for _, there in tables]),
+        },
+    )
+
+
+def lever_arms(recording: Recording) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Tags of every robot as a sensor's setting; all robots must carry equally many."""
+    if np.isnan(recording.tags).any():
+        raise DataError(f"{recording.name}: its robots carry different numbers of tags")
+    return tuple(tuple(tuple(arm) for arm in robot) for robot in recording.tags.tolist())
+
+
+def _ranges(
+    recording: Recording,
+    grid: Grid,
+    stream: str,
+    slots: Sequence[np.ndarray],
+    count: int,
+    columns: slice,
+) -> tuple[Tape, Tape]:
+    values, there = [], []
+    for table, slot in zip(recording.streams[stream], slots, strict=True):
+        seen, mask = slots_on(grid, table, slot, count, columns)
+        if mask.shape[1] > 1:
+            raise DataError(
+                f"{recording.name}: {stream} deliver one pair twice within {grid.dt} s; "
+                "choose a smaller dt"
+            )
+        values.append(seen[:, 0, :, 0])
+        there.append(mask[:, 0])
+    return _tape(values), _tape(there)
+
+
+def _tape(robots: Sequence[np.ndarray]) -> Tape:
+    """One leaf of all robots, [T, N, F] float32."""
+    stacked: Tensor = torch.from_numpy(np.stack(robots, 1)).to(torch.float32)
+    return Tape(stacked)

@@ -1,0 +1,175 @@
+"""``replay-…-v0``: real recordings through the same world, faces and localizers.
+
+The data are their owners' and not part of this package: see ``coloc_env.datasets``. Loading is lazy
+(at ``make_scenario``) and parsing is cached on disk.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from coloc_env.datasets import DataError, Recording, load
+from coloc_env.datasets.grid import Grid, common_grid
+from coloc_env.datasets.replay import (
+    arena_of,
+    recorded_bearings,
+    recorded_imu,
+    recorded_motion,
+    recorded_odometry,
+)
+from coloc_env.network import Network
+from coloc_env.scenario import Inertial, Prior, Scenario, Wheeled
+from coloc_env.scenarios.registry import register
+from coloc_env.sensors import (
+    Imu,
+    LandmarkBearings,
+    Landmarks,
+    Odometry,
+    RangeNoise,
+    Ranging,
+    UavBearings,
+)
+
+# Mean of the bias states that the ground truth of MH_04_difficult carries: another flight of the
+# same vehicle, so no segment is calibrated on itself. Gyro (rad/s), accelerometer (m/s²), FLU body.
+_EUROC_BIAS = (0.07665, -0.02107, -0.00214, 0.0595, -0.1371, -0.0273)
+
+
+def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
+    """The part of a recording from ``span[0]`` to ``span[1]`` s after its common start."""
+    if span is None:
+        return grid
+    first, last = (round(s / grid.dt) for s in span)
+    last = min(last, grid.count - 1)
+    if not 0 <= first < last:
+        raise ValueError(
+            f"span={span} is not allowed: (from, to) in s within 0 and {grid.count * grid.dt:.1f}"
+        )
+    return Grid(int(grid.times[first]), grid.dt, last - first + 1)
+
+
+@lru_cache(maxsize=4)
+def _loaded(name: str, sequence: str | None, data: str | None) -> Recording:
+    return load(name, sequence, data)
+
+
+@register("replay-mrclam-v0")
+def replay_mrclam(
+    *,
+    sequence: str | None = None,
+    data: str | None = None,
+    dt: float = 0.1,
+    span: tuple[float, float] | None = None,
+    reward: str = "error",
+    prior_std: float = 0.1,
+    forward_std: float = 0.03,
+    turn_std: float = 0.1,
+    odometry_relative: float = 0.2,
+    odometry_delay: float = 0.0,
+    odometry_scale: float = 1.0,
+    range_std: float = 0.2,
+    bearing_std: float = 0.04,
+) -> Scenario:
+    """Five ground robots for 756 s: odometry, range and bearing to 15 landmarks and to each other
+    (UTIAS MRCLAM). Nothing is simulated but the prior's draw.
+
+    Odometry is the commanded velocity, used as it is; ``odometry_delay=0.25`` (s) and
+    ``odometry_scale=0.93`` correct what the first 250 s show of it. The noise settings are the
+    team's belief, chosen on those 250 s.
+    """
+    if odometry_delay < 0 or odometry_scale <= 0:
+        raise ValueError("odometry_delay is a time in s ≥ 0, odometry_scale a factor > 0")
+    recording = _loaded("mrclam", sequence, data)
+    grid = cut(common_grid(recording, dt, ("odometry",)), span)
+    odometry = Odometry(forward_std, 0.5 * forward_std, turn_std, odometry_relative)
+    landmarks = LandmarkBearings(len(recording.landmarks), range_std, bearing_std)
+    robots = UavBearings(range_std, bearing_std)
+    seen, depth = recorded_bearings(recording, grid, landmarks)
+    landmarks = replace(landmarks, depth=depth)
+    met, depth = recorded_bearings(recording, grid, robots)
+    robots = replace(robots, depth=depth)
+    return Scenario(
+        name="replay-mrclam-v0",
+        arena=arena_of(recording, grid, margin=1.0),
+        horizon=grid.count - 1,
+        motion=recorded_motion(recording, grid),
+        sensors=(
+            recorded_odometry(recording, grid, odometry, odometry_delay, odometry_scale),
+            replace(seen, sensor=landmarks),
+            replace(met, sensor=robots),
+        ),
+        network=Network(),
+        prior=Prior(position_std=prior_std, velocity_std=0.05, attitude_std=0.05),
+        process=Wheeled(),
+        believed_sensors=(odometry, landmarks, robots),
+        reward=reward,
+    )
+
+
+@register("replay-euroc-v0")
+def replay_euroc(
+    *,
+    sequence: str | None = None,
+    data: str | None = None,
+    dt: float = 0.1,
+    span: tuple[float, float] | None = None,
+    reward: str = "error",
+    prior_std: float = 2.0,
+    prior: str = "gaussian",
+    landmarks: int = 20,
+    landmark_std: float = 0.15,
+    landmark_radius: float = 10.0,
+    false_matches: float = 0.0,
+    landmark_dropout: float = 0.0,
+    range_only: tuple[float, float] | None = None,
+    uwb_std: float = 0.2,
+    nlos: float = 0.0,
+    nlos_bias: float = 1.0,
+    accel_std: float = 0.05,
+    gyro_std: float = 0.003,
+    estimate_bias: bool = True,
+) -> Scenario:
+    """Three real flights of one vehicle in one room "together" (EuRoC V1): IMU, biases and motion
+    are real, UWB and landmarks simulated as in ``indoor-v0``.
+
+    The IMU's bias is calibrated on another flight (MH_04), what is left of it is estimated unless
+    ``estimate_bias=false``.
+    """
+    if landmarks < 0:
+        raise ValueError(f"landmarks={landmarks} is not allowed: a count ≥ 0")
+    recording = _loaded("euroc", sequence, data)
+    grid = cut(common_grid(recording, dt, ("imu",)), span)
+    imu = Imu(accel_std, gyro_std)
+    bias = np.tile(_EUROC_BIAS, (len(recording.robots), 1))
+    uwb = Ranging(RangeNoise(std=uwb_std, nlos=nlos, nlos_bias=nlos_bias))
+    sensors = [recorded_imu(recording, grid, imu, bias), uwb]
+    believed = [imu, Ranging(RangeNoise(std=uwb_std))]
+    if landmarks:
+        sensors.append(
+            Landmarks(
+                landmarks, landmark_std, landmark_radius, false_matches, landmark_dropout, range_only
+            )
+        )
+        believed.append(Landmarks(landmarks, landmark_std, landmark_radius))
+    # The bias left over: prior and walk wide enough for what the calibration flight cannot know.
+    process = Inertial(0.1, 0.003, accel_walk=0.01, gyro_walk=1e-4) if estimate_bias else Inertial()
+    return Scenario(
+        name="replay-euroc-v0",
+        arena=arena_of(recording, grid, margin=1.5),
+        horizon=grid.count - 1,
+        motion=recorded_motion(recording, grid),
+        sensors=tuple(sensors),
+        network=Network(),
+        prior=Prior(position_std=prior_std, kind=prior),
+        process=process,
+        believed_sensors=tuple(believed),
+        reward=reward,
+    )
+
+
+def require_streams(recording: Recording, *names: str) -> None:
+    """Raise DataError unless the recording has these streams."""
+    for name in names:
+        if name not in recording.streams:
+            raise DataError(f"{recording.name} has no {name} stream, which this scenario needs")
