@@ -40,7 +40,7 @@ _FIXED = {"position": 0.03, "velocity": 0.03, "attitude": 0.01, "accel": 0.01, "
 _RESAMPLE = 0.5  # share of M below which the effective sample size triggers resampling
 _START_STEPS = 3  # steps in which the likelihood is tempered down to that share
 _RESCUE = 0.1  # the share below which it is tempered later
-_START_STAGES, _STAGES = 40, 5  # at most so many stages in those first steps, and later
+_STAGES = 40  # more than any likelihood has needed
 
 
 class ParticleBelief(TensorClass["nocast"]):
@@ -133,7 +133,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             batch_size=key.shape,
         )
         few = ess < _RESAMPLE * self.particles
-        moved = self._resample(mean, apart, covariance, weights, noise.fold(key, _START_STAGES))
+        moved = self._resample(mean, apart, covariance, weights, noise.fold(key, _STAGES))
         after = ParticleBelief(
             particles=torch.where(few[..., None, None], moved, particles),
             log_weights=log_weights.masked_fill(few[..., None], -math.log(self.particles)),
@@ -182,10 +182,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
         if not (self.tempering and bool(staged.any())):
             return particles, log_weights + gain
         left = torch.ones_like(gain[..., 0])
-        most = torch.where(step < _START_STEPS, _START_STAGES, _STAGES)
-        for stage in range(_START_STAGES):
-            in_parts = staged & (stage < most - 1)
-            share = torch.where(in_parts, increment(log_weights, gain, left, _RESAMPLE), left)
+        for stage in range(_STAGES):
+            share = left
+            if stage < _STAGES - 1:
+                share = torch.where(staged, increment(log_weights, gain, left, _RESAMPLE), left)
             log_weights = (log_weights + share.unsqueeze(-1) * gain).log_softmax(-1)
             left = left - share
             go_on = left > 0

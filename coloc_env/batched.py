@@ -15,6 +15,7 @@ from coloc_env.observation import (
 )
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
+from coloc_env.sense import Sensed
 from coloc_env.world import World
 
 
@@ -45,6 +46,7 @@ class CoLocEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)
+        self._sensed: Sensed | None = None
         self._set_seed(seed)
         self._make_specs()
 
@@ -97,21 +99,38 @@ class CoLocEnv(EnvBase):
         step = self.world.step(action)
         out = self._observe()
         out["uav"].set("reward", step.reward.unsqueeze(-1))
-        truncated = step.truncated.unsqueeze(-1)
-        terminated = ~self.world.alive.any(-1, keepdim=True)
-        out.set("terminated", terminated)
-        out.set("truncated", truncated)
-        out.set("done", terminated | truncated)
         return out
 
     def _observe(self) -> TensorDictBase:
-        b, n = self.batch_size[0], self.scenario.arena.n_uavs
-        observation = self.world.observation().to_tensordict()
-        uav = TensorDict(
-            {"observation": observation, "mask": self.world.alive},
-            batch_size=[b, n],
-            device=self.device,
-        )
+        """The current step's entries, reward aside."""
+        if self.world.sensed is not self._sensed:
+            self._sensed = self.world.sensed
+            self._frames = self._window(self._sensed).unbind(1)
+        out = self._frames[self.world.cursor]
+        observation = out["uav", "observation"]
+        messages, heard = self.world.messages()
+        observation.set("messages", messages)
+        observation.set("message_mask", heard)
+        return out
+
+    def _window(self, sensed: Sensed) -> TensorDict:
+        """A window of steps [B, K], made once: building a TensorDict a step costs more."""
+        shape = (*sensed.steps.shape, self.scenario.arena.n_uavs)
+        static = {
+            name: leaf.unsqueeze(1).expand(*shape, -1) for name, leaf in self.world.static.items()
+        }
+        observation = TensorDict({**sensed.leaves, **static}, shape, device=self.device)
+        uav = TensorDict({"observation": observation, "mask": sensed.alive}, shape, self.device)
+        truncated = sensed.over.unsqueeze(-1)
+        terminated = ~sensed.alive.any(-1, keepdim=True)
         return TensorDict(
-            {"uav": uav, "state": self.world.state()}, batch_size=[b], device=self.device
+            {
+                "uav": uav,
+                "state": sensed.states,
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            shape[:2],
+            self.device,
         )

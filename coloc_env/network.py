@@ -10,6 +10,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.sensors.base import require, squared_norm
 
+_BLOCK = 65536  # pairs of UAVs compared at once on a CPU: what stays in cache
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
@@ -59,33 +60,35 @@ class Network:
             if self.walls:
                 reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
             return index, reach
-        return self._nearest(position, alive)
+        items = (position.flatten(0, 1), alive.flatten(0, 1))
+        block = max(1, _BLOCK // (n * n)) if position.device.type == "cpu" else len(items[0])
+        parts = [self._nearest(*part) for part in zip(*(x.split(block) for x in items), strict=True)]
+        index, reach = (torch.cat(part) for part in zip(*parts, strict=True))
+        return index.unflatten(0, position.shape[:2]), reach.unflatten(0, position.shape[:2])
 
     def _nearest(
-        self, position: Float64[Tensor, "R K N d"], alive: Bool[Tensor, "R K N"]
-    ) -> tuple[Int64[Tensor, "R K N S"], Bool[Tensor, "R K N S"]]:
+        self, position: Float64[Tensor, "I N d"], alive: Bool[Tensor, "I N"]
+    ) -> tuple[Int64[Tensor, "I N S"], Bool[Tensor, "I N S"]]:
         """The nearest UAVs in reach, by one sort of unique integers (distance bits, then index)."""
-        n = position.shape[2]
-        components = [c.contiguous() for c in position.unbind(-1)]
-        squared = None
-        for c in components:
-            apart = (c.unsqueeze(2) - c.unsqueeze(3)).to(torch.float32)
-            squared = apart.mul_(apart) if squared is None else squared.addcmul_(apart, apart)
-        assert squared is not None
-        dead = ~alive
-        excluded = torch.eye(n, dtype=torch.bool, device=position.device) | dead.unsqueeze(2)
+        n = position.shape[1]
+        about = (position - position[:, :1]).to(torch.float32)  # exact enough about a local origin
+        squared = about.new_zeros(len(position), n, n)
+        for c in about.unbind(-1):
+            apart = c.unsqueeze(1) - c.unsqueeze(2)
+            squared.addcmul_(apart, apart)
+        squared.diagonal(dim1=-2, dim2=-1).fill_(float("inf"))
+        squared.masked_fill_(~alive.unsqueeze(1), float("inf"))
         if self.walls:
-            excluded = excluded | self._blocked(position.unsqueeze(3), position.unsqueeze(2))
-        squared.masked_fill_(excluded, float("inf"))
+            blocked = self._blocked(position.unsqueeze(2), position.unsqueeze(1))
+            squared.masked_fill_(blocked, float("inf"))
         # A non-negative float32 orders like its bits read as an integer; the index makes it unique.
         order = squared.view(torch.int32).to(torch.int64).bitwise_left_shift_(20)
         order.bitwise_or_(torch.arange(n, device=position.device))
         order = _sorted(order)[..., : self.max_neighbours]
-        index = order & 0xFFFFF
         limit = float("inf") if self.radius is None else self.radius**2
         distance = (order >> 20).to(torch.int32).view(torch.float32)
         reach = (distance <= limit) & (distance < float("inf")) & alive.unsqueeze(-1)
-        return index.contiguous(), reach
+        return order & 0xFFFFF, reach
 
     def _blocked(
         self, start: Float64[Tensor, "*#s d"], end: Float64[Tensor, "*#s d"]

@@ -59,7 +59,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._next_seed: int | None = None
         self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
-        self._window: Sensed | None = None
+        self._window: _Window | None = None
         self._renderer = None if render_mode is None else Renderer(scenario)
 
     def observation_space(self, agent: str) -> gym.spaces.Dict:
@@ -105,21 +105,23 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         estimates = self._estimates_of(actions)
         if self._renderer is not None:
             self._renderer.record(world, estimates)
+        scored = self._window.scored[world.cursor]
         step = world.step(estimates)
-        self._tally.add(step.error[0].numpy(), step.scored[0].numpy())
-        infos = self._of(acting, self._tally.infos())
+        self._tally.add(step.error.numpy()[0], scored)
         observations = self._observe(acting)
-        rewards, over = step.reward[0].tolist(), bool(step.truncated)
-        terminated = dict.fromkeys(acting, False)
-        truncated = dict.fromkeys(acting, over)
-        for i in step.terminated[0].nonzero()[:, 0].tolist() if self._can_fail else ():
-            failed = self.possible_agents[i]
-            terminated[failed], truncated[failed] = True, False
+        infos = self._of(acting, self._tally.infos())
+        rewards = self._of(acting, step.reward.tolist()[0])
+        over = bool(self._window.over[world.cursor])
+        terminated, truncated = dict.fromkeys(acting, False), dict.fromkeys(acting, over)
+        if self._can_fail:
+            for i in np.flatnonzero(self._window.failed[world.cursor]):
+                failed = self.possible_agents[i]
+                terminated[failed], truncated[failed] = True, False
         if over:
             self.agents = []
         elif self._can_fail:
             self.agents = [a for a in acting if not terminated[a]]
-        return observations, self._of(acting, rewards), terminated, truncated, infos
+        return observations, rewards, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
         """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
@@ -148,8 +150,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             what = f"no action for {missing[0]}" if missing else f"{unknown[0]!r} is not acting"
             raise ValueError(f"{name}: {what}; agents now: {', '.join(agents)}")
         try:
-            stacked = np.array([actions[a] for a in agents], dtype=np.float32)
-            fits = stacked.shape == (len(agents), self._width)
+            stacked = np.array([[actions[a] for a in agents]], dtype=np.float32)
+            fits = stacked.shape == (1, len(agents), self._width)
         except (TypeError, ValueError):
             fits = False
         if not fits:
@@ -159,15 +161,15 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
                 f"({self._width},) is needed: [position, velocity, log-std]"
             )
         if not np.isfinite(stacked).all():
-            wrong = agents[int(np.flatnonzero(~np.isfinite(stacked).all(1))[0])]
+            wrong = agents[int(np.flatnonzero(~np.isfinite(stacked[0]).all(1))[0])]
             raise ValueError(
                 f"{name}: the action of {wrong} holds NaN or infinity; every number must be finite"
             )
         if len(agents) < len(self.possible_agents):
-            every = np.zeros((len(self.possible_agents), self._width), np.float32)
-            every[[self._index[a] for a in agents]] = stacked
+            every = np.zeros((1, len(self.possible_agents), self._width), np.float32)
+            every[0, [self._index[a] for a in agents]] = stacked[0]
             stacked = every
-        return torch.from_numpy(stacked).unsqueeze(0)
+        return torch.from_numpy(stacked)
 
     def _of(self, agents: list[str], every: list[T]) -> dict[str, T]:
         """The entries of some agents from a list of all."""
@@ -178,13 +180,23 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def _observe(self, agents: list[str]) -> dict[str, dict[str, np.ndarray]]:
         """Each agent's leaves: views of a window that the world never writes to again."""
         world = self.world
-        if world.sensed is not self._window:
-            self._window = world.sensed
-            self._leaves = [leaf[0].numpy() for leaf in world.sensed.leaves.values()]
-        messages, mask = world.messages()
-        now = [leaf[world.cursor] for leaf in self._leaves]
-        rows = zip(*now, messages[0].numpy(), mask[0].numpy(), *self._static, strict=True)
+        if self._window is None or world.sensed is not self._window.sensed:
+            self._window = _Window(world.sensed)
+        messages, heard = world.messages()
+        now = [leaf[world.cursor] for leaf in self._window.leaves]
+        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *self._static, strict=True)
         return self._of(agents, [dict(zip(self._names, row, strict=True)) for row in rows])
+
+
+class _Window:
+    """A window of the one world as arrays [K, …], converted once."""
+
+    def __init__(self, sensed: Sensed) -> None:
+        self.sensed = sensed
+        self.over = sensed.over.numpy()[0]
+        self.failed = sensed.failed.numpy()[0]
+        self.scored = sensed.scored.numpy()[0]
+        self.leaves = [leaf.numpy()[0] for leaf in sensed.leaves.values()]
 
 
 class _Tally:

@@ -31,6 +31,8 @@ class _Rows:
 
 
 def _apply(f: Callable[..., Tensor], first: Any, *others: Any) -> Any:
+    if first is None:
+        return None
     if isinstance(first, dict):
         return {name: f(value, *(other[name] for other in others)) for name, value in first.items()}
     return f(first, *others)
@@ -46,34 +48,40 @@ class Past(_Rows):
 
 
 class Frame(NamedTuple):
-    """One step of a window; ``failed`` marks UAVs that fail at this very step."""
+    """What the world itself needs of one step.
 
-    position: Float64[Tensor, "R N d"]
-    velocity: Float64[Tensor, "R N d"]
-    attitude: Float64[Tensor, "R N a"]
+    ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
+    on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
+    ``senders[…, s]`` (None: from UAV s); ``unheard`` and ``heard`` say where none gets through.
+    """
+
+    target: Float32[Tensor, "R N d"]
     steps: Int64[Tensor, "R"]
     over: Bool[Tensor, "R"]
     alive: Bool[Tensor, "R N"]
     failed: Bool[Tensor, "R N"]
     scored: Bool[Tensor, "R N"]
+    unheard: Bool[Tensor, "R N S 1"]
+    heard: Float32[Tensor, "R N S"]
+    senders: Int64[Tensor, "R N S"] | None
 
 
 @dataclass(frozen=True)
 class Sensed(_Rows):
-    """A window of truth (float64) and leaves (float32): [R, K, N, …] each.
-
-    ``steps`` counts each row's own, ``over`` is true from the horizon on, ``failed`` in the step in
-    which a UAV fails.
-    """
+    """A window of truth (float64) and leaves (float32), [R, K, N, …] each, and what ``Frame`` has."""
 
     position: Float64[Tensor, "R K N d"]
     velocity: Float64[Tensor, "R K N d"]
     attitude: Float64[Tensor, "R K N a"]
+    target: Float32[Tensor, "R K N d"]
     steps: Int64[Tensor, "R K"]
     over: Bool[Tensor, "R K"]
     alive: Bool[Tensor, "R K N"]
     failed: Bool[Tensor, "R K N"]
     scored: Bool[Tensor, "R K N"]
+    unheard: Bool[Tensor, "R K N S 1"]
+    heard: Float32[Tensor, "R K N S"]
+    senders: Int64[Tensor, "R K N S"] | None
     leaves: dict[str, Float32[Tensor, "R K N F"]]
 
     @property
@@ -84,8 +92,9 @@ class Sensed(_Rows):
     @cached_property
     def frames(self) -> list[Frame]:
         """The window's steps one by one (views, cut in one go: far cheaper than one at a time)."""
-        parts = (getattr(self, name).unbind(1) for name in Frame._fields)
-        return [Frame(*views) for views in zip(*parts, strict=True)]
+        parts = [getattr(self, name) for name in Frame._fields]
+        cut = ([None] * self.count if part is None else part.unbind(1) for part in parts)
+        return [Frame(*views) for views in zip(*cut, strict=True)]
 
     @cached_property
     def leaf_frames(self) -> list[dict[str, Float32[Tensor, "R N F"]]]:
@@ -94,11 +103,11 @@ class Sensed(_Rows):
         return [dict(zip(self.leaves, views, strict=True)) for views in zip(*parts, strict=True)]
 
     @cached_property
-    def states(self) -> tuple[Float32[Tensor, "R S"], ...]:
-        """Each step's truth, flat: per UAV position, velocity, attitude, alive, scored."""
+    def states(self) -> Float32[Tensor, "R K S"]:
+        """The truth, flat: per UAV position, velocity, attitude, alive, scored."""
         flags = torch.stack((self.alive, self.scored), -1)
         parts = (self.position, self.velocity, self.attitude, flags)
-        return torch.cat([p.to(torch.float32) for p in parts], -1).flatten(2).unbind(1)
+        return torch.cat([p.to(torch.float32) for p in parts], -1).flatten(2)
 
     @cached_property
     def all_scored(self) -> bool:
@@ -160,19 +169,25 @@ def sense(
     leaves: dict[str, Tensor] = {}
     for sensor, own in zip(scenario.sensors, placed, strict=True):
         leaves |= sensor.sample(window, own)
-    leaves["links"] = network.links(step_keys, neighbours, reach).to(torch.float32)
-    if not network.dense(arena.n_uavs):
+    heard = network.links(step_keys, neighbours, reach)
+    leaves["links"] = heard.to(torch.float32)
+    dense = network.dense(arena.n_uavs)
+    if not dense:
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
     sensed = Sensed(
-        motion.position,
-        motion.velocity,
-        motion.attitude,
-        steps,
-        steps >= scenario.horizon,
-        alive,
-        steps.unsqueeze(-1) == fails_at,
-        alive if moved.valid is None else alive & moved.valid,
-        leaves,
+        position=motion.position,
+        velocity=motion.velocity,
+        attitude=motion.attitude,
+        target=motion.position.to(torch.float32),
+        steps=steps,
+        over=steps >= scenario.horizon,
+        alive=alive,
+        failed=steps.unsqueeze(-1) == fails_at,
+        scored=alive if moved.valid is None else alive & moved.valid,
+        unheard=~heard.unsqueeze(-1),
+        heard=leaves["links"].clone(),
+        senders=None if dense else neighbours,
+        leaves=leaves,
     )
     return sensed, carry, whole.map(lambda x: x[:, -lead:])
 

@@ -191,8 +191,7 @@ class World:
         The next step's measurements are ``observation()``.
         """
         error, scored = self.score(estimates)
-        position = self.now.position
-        value = reward(self.scenario.reward, estimates, position, error, scored)
+        value = reward(self.scenario.reward, estimates, self.now.target, error, scored)
         self.advance(estimates)
         now = self.now
         return Step(value, error, scored, terminated=now.failed, truncated=now.over)
@@ -200,15 +199,18 @@ class World:
     def score(
         self, estimates: Float32[Tensor, "B N A"]
     ) -> tuple[Float32[Tensor, "B N"], Bool[Tensor, "B N"]]:
-        """Position error in m at the current step, and where it counts."""
+        """Position error in m at the current step, and where it counts.
+
+        Estimates are float32, and so is the truth they are scored against: the true position as an
+        action has an error of exactly 0.
+        """
         now, dim = self.now, self.scenario.arena.dim
-        difference = estimates[..., :dim] - now.position
-        error = torch.linalg.vector_norm(difference, dim=-1).to(torch.float32)
+        error = torch.linalg.vector_norm(estimates[..., :dim] - now.target, dim=-1)
         return error if self.sensed.all_scored else error * now.scored, now.scored
 
     def advance(self, estimates: Float32[Tensor, "B N A"]) -> None:
-        """Send the estimates as messages and move to the next step."""
-        self._sent.append(estimates)
+        """Send (copies of) the estimates as messages and move to the next step."""
+        self._sent.append(estimates.clone())
         self.cursor += 1
         self._since_reset += 1
         if self.cursor == self.sensed.count:
@@ -218,13 +220,14 @@ class World:
 
     @property
     def now(self) -> Frame:
-        """Truth, progress and who counts at the current step."""
+        """Progress, who counts and who hears whom at the current step."""
         return self.sensed.frames[self.cursor]
 
     @property
     def truth(self) -> Kinematics:
         """True kinematics [B, N, …] at the current step (float64); privileged."""
-        return Kinematics(*self.now[:3])
+        s, i = self.sensed, self.cursor
+        return Kinematics(s.position[:, i], s.velocity[:, i], s.attitude[:, i])
 
     @property
     def alive(self) -> Bool[Tensor, "B N"]:
@@ -243,24 +246,25 @@ class World:
 
     def state(self) -> Float32[Tensor, "B S"]:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""
-        return self.sensed.states[self.cursor]
+        return self.sensed.states[:, self.cursor]
 
     def messages(self) -> tuple[Float32[Tensor, "B N F"], Float32[Tensor, "B N S"]]:
         """Delivered messages and their mask: what senders' actions said 1 + delay steps ago."""
-        leaves = self.sensed.leaf_frames[self.cursor]
-        mask = leaves["links"]
+        now = self.now
         if len(self._sent) <= self._delay:
-            b, n, s = mask.shape
-            return mask.new_zeros(b, n, s * self._width), torch.zeros_like(mask)
+            b, n, slots = now.heard.shape
+            return now.heard.new_zeros(b, n, slots * self._width), torch.zeros_like(now.heard)
+        sent, heard, unheard = self._sent[0], now.heard, now.unheard
         if self._since_reset <= self._delay:
-            mask = mask * (self.step_index > self._delay)[:, None, None]
-        content = self._sent[0].unsqueeze(1)
-        if "neighbours" in leaves:
-            senders = leaves["neighbours"].to(torch.int64)
-            rows = torch.arange(len(senders), device=self.device)[:, None, None]
-            content = self._sent[0][rows, senders]
+            early = (now.steps <= self._delay)[:, None, None]
+            heard, unheard = heard.masked_fill(early, 0.0), unheard | early.unsqueeze(-1)
+        if now.senders is None:
+            content = sent.unsqueeze(1)
+        else:
+            rows = torch.arange(len(sent), device=self.device)[:, None, None]
+            content = sent[rows, now.senders]
         # Filled, not multiplied: a diverged sender's NaN reaches only those who hear it.
-        return content.masked_fill((mask == 0).unsqueeze(-1), 0.0).flatten(-2), mask.clone()
+        return content.masked_fill(unheard, 0.0).flatten(-2), heard
 
     def observation(self) -> Observation:
         """What every UAV observes at the current step."""

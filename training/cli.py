@@ -18,6 +18,16 @@ if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
 
 _FRAMES = 300  # at most, in an animation
+_SHOWN = (  # what fits on a terminal
+    "rmse",
+    "median",
+    "max",
+    "rmse_after_10s",
+    "diverged_runs",
+    "nees",
+    "ms_per_step",
+    "ratio_to_bound",
+)
 
 
 class _Plain(TyperGroup):
@@ -55,9 +65,7 @@ app = typer.Typer(
     """,
 )
 
-ScenarioName = Annotated[
-    str, typer.Argument(metavar="SCENARIO", help="See **coloc scenarios**.")
-]
+ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="See **coloc scenarios**.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -123,7 +131,7 @@ def evaluate(
         tell("files", 0, 1)
         files.write(found, folder, figures)
         tell("files", 1, 1)
-    _show(["", *files.COLUMNS.values()], files.rows(found))
+    _show(["", *(files.COLUMNS[key] for key in _SHOWN)], files.rows(found, _SHOWN))
     for name, one in found.agents.items():
         if one.raised:
             what = f"{name} raised in {one.raised} of {found.runs} runs; first at {one.message}"
@@ -262,32 +270,30 @@ def _explain(
     function: Callable[[], Callable[..., Any]],
 ) -> None:
     from coloc_env.options import describe
+    from training.results import typed
 
     text = "\n\n".join(map(escape, _paragraphs(function())))
     Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
-    lines = [[key, describe(p.annotation), _default(p.default)] for key, p in known.items()]
+    lines = [[key, describe(p.annotation), typed(p.default)] for key, p in known.items()]
     if lines:
         _show([kind, "type", "default"], lines)
     else:
         typer.echo(f"no {kind}s")
 
 
-def _default(value: Any) -> str:
-    """A default as it would be typed."""
-    if isinstance(value, tuple):
-        return ",".join(map(str, value))
-    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
-
-
 def _show(header: list[str], lines: list[list[str]]) -> None:
+    """A table; where it must be narrowed, words give way to names and numbers."""
     table = Table(box=None, pad_edge=False, header_style="bold")
-    numeric = len(header) > 3
+    numbers = len(header) > 3
     for i, title in enumerate(header):
-        right = numeric and i > 0
-        table.add_column(title, justify="right" if right else "left", no_wrap=i == 0)
+        right = numbers and i > 0
+        table.add_column(title, justify="right" if right else "left", no_wrap=right or i == 0)
     for line in lines:
         table.add_row(*map(escape, line))
-    Console().print(table, highlight=False)
+    console = Console()
+    if not console.is_terminal:
+        console.width = 160
+    console.print(table, highlight=False)
 
 
 @contextmanager

@@ -74,7 +74,7 @@ def error_over_time(results: Results) -> Figure:
         axes.plot(time, metrics.rmse_per_step(bound, results.bound.scored.numpy()), **_BOUND)
     axes.set(xlabel="time (s)", ylabel="position error (m)", xlim=_span(time, results.dt))
     _log(axes.yaxis, axes.set_yscale)
-    axes.set_ylim(top=min(axes.get_ylim()[1], _farthest(results)))
+    _cut(axes.get_ylim, axes.set_ylim, _farthest(results))
     _legend(figure, results)
     return figure
 
@@ -90,7 +90,7 @@ def error_distribution(results: Results) -> Figure:
     _mark_bound(axes, results)
     axes.set(xlabel="position error (m)", ylabel="share of errors below (%)", ylim=(0, 100))
     _log(axes.xaxis, axes.set_xscale)
-    axes.set_xlim(right=min(axes.get_xlim()[1], _farthest(results)))
+    _cut(axes.get_xlim, axes.set_xlim, _farthest(results))
     _legend(figure, results)
     return figure
 
@@ -98,7 +98,8 @@ def error_distribution(results: Results) -> Figure:
 def error_boxes(results: Results) -> Figure:
     """RMSE of each UAV in each run: quartiles, 5 % to 95 % whiskers, every one as a dot."""
     count, limit = len(results.agents), _farthest(results)
-    note = "box: quartiles; whiskers: 5 % to 95 %; dots: every UAV and run; dashed: bound"
+    note = "box: quartiles; whiskers: 5 % to 95 %; dots: every UAV and run"
+    note += "" if results.bound is None else "; dashed: bound"
     figure, axes = _figure(results, "RMSE of each UAV in each run", note, 1.7 + 0.5 * count)
     jitter = np.random.default_rng(0)
     for row, (name, look) in enumerate(_looks(results).items()):
@@ -128,7 +129,7 @@ def error_boxes(results: Results) -> Figure:
     _mark_bound(axes, results)
     axes.set(xlabel="RMSE (m)", ylim=(count - 0.5, -0.5))
     _log(axes.xaxis, axes.set_xscale)
-    axes.set_xlim(right=min(axes.get_xlim()[1], limit))
+    _cut(axes.get_xlim, axes.set_xlim, limit)
     axes.set_yticks(range(count), list(results.agents))
     axes.grid(False, axis="y")
     return figure
@@ -150,7 +151,7 @@ def consistency(results: Results) -> Figure:
     axes.axhline(dim, color=INK, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="NEES of the position", xlim=_span(time, results.dt))
     _log(axes.yaxis, axes.set_yscale)
-    axes.set_ylim(top=min(axes.get_ylim()[1], 1000 * dim))
+    _cut(axes.get_ylim, axes.set_ylim, 1000 * dim)
     _legend(figure, results, bound=False)
     return figure
 
@@ -229,13 +230,26 @@ def _mark_bound(axes: Axes, results: Results) -> None:
 
 
 def _log(axis: Any, set_scale: Callable[[str], None]) -> None:
-    """A logarithmic axis with plain numbers."""
+    """A logarithmic axis with plain numbers, if there is anything on it."""
+    if not np.isfinite(axis.get_minpos()):
+        return
     set_scale("log")
     low, high = sorted(axis.get_view_interval())
     steps = (1, 2, 5) if high < 50 * low else (1, 3) if high < 3000 * low else (1,)
     axis.set_major_locator(LogLocator(subs=steps, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _cut(
+    get_limits: Callable[[], tuple[float, float]],
+    set_limits: Callable[[float, float], object],
+    highest: float,
+) -> None:
+    """Leave out what lies beyond ``highest``, unless that is everything."""
+    low, high = get_limits()
+    if low < highest < high:
+        set_limits(low, highest)
 
 
 def _farthest(results: Results) -> float:

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,11 +21,11 @@ FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajector
 NAMES = ("results.csv", "table.md", *FIGURES, "tum", "results.json")
 COLUMNS = {
     "rmse": "RMSE",
-    "rmse_std": "± over runs",
+    "rmse_std": "± runs",
     "mean": "mean",
     "median": "median",
     "max": "max",
-    "rmse_after_10s": "RMSE after 10 s",
+    "rmse_after_10s": "after 10 s",
     "diverged_runs": "diverged",
     "nees": "NEES",
     "avg_particles": "particles",
@@ -33,10 +34,11 @@ COLUMNS = {
 }
 
 _EXPLAINED = """\
-Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs; max is the
-mean over runs and UAVs of the largest error. A run counts as diverged if a UAV's error stays above
-{:g} m over its last {:g} s, or if an estimate was not finite; it stays in every figure. NEES: {}
-is consistent, more is overconfident. ms/step: the whole team, one world, one thread."""
+Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs, ± its
+standard deviation over runs; max is the mean over runs and UAVs of the largest error. A run counts
+as diverged if a UAV's error stays above {:g} m over its last {:g} s, or if an estimate was not
+finite; it stays in every figure. NEES: {} is consistent, more is overconfident. ms/step: the whole
+team, one world, one thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +183,15 @@ def _plain(value: Any) -> Any:
 # ------------------------------------------------------------------ tables and files
 
 
-def rows(results: Results) -> list[list[str]]:
+def rows(results: Results, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     """The main table as text: one line for the bound, if known, and one per agent."""
+    keys = tuple(keys)
     bound, lines = results.bound, []
     if bound is not None:
         known = {"rmse": bound.rmse, "rmse_after_10s": bound.rmse_after(10.0)}
-        lines.append(["bound", *(_short(_plain(known.get(key))) for key in COLUMNS)])
+        lines.append(["bound", *(_short(_plain(known.get(key))) for key in keys)])
     for name, figures in results.summary["agents"].items():
-        lines.append([name, *(_short(figures[key]) for key in COLUMNS)])
+        lines.append([name, *(_short(figures[key]) for key in keys)])
     return lines
 
 
@@ -199,7 +202,7 @@ def markdown(results: Results) -> str:
     last = results.seed + results.runs - 1
     text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
     if results.scenario.overrides:
-        chosen = (f"`{key}={value}`" for key, value in results.scenario.overrides.items())
+        chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
     text += _table(["agent", *COLUMNS.values()], rows(results))
     text += ["", _EXPLAINED.format(results.lost_beyond, metrics.LOST_SECONDS, dim)]
@@ -212,6 +215,13 @@ def markdown(results: Results) -> str:
             how_many = f"{one.raised} of {results.runs} runs"
             text += ["", f"`{name}` raised in {how_many}; the first at {one.message}"]
     return "\n".join(text) + "\n"
+
+
+def typed(value: Any) -> str:
+    """A setting as it would be typed on a command line."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(typed, value))
+    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
 def csv_text(results: Results) -> str:

@@ -1,5 +1,6 @@
 """Writing that is never half done: into a hidden neighbour first, then renamed into place."""
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -59,26 +60,31 @@ def _made(parent: Path, name: str) -> Iterator[Path]:
     """``parent / name`` for something to be made there; gone at the end, and so is the parent if it
     was made for this and nothing came of it."""
     missing = [p for p in (parent, *parent.parents) if not p.exists()]
-    partial = parent / name
-    done = False
+    partial, done = parent / name, False
     try:
-        try:
-            parent.mkdir(parents=True, exist_ok=True)
-            if not os.access(parent, os.W_OK | os.X_OK):
-                raise PermissionError(13, "Permission denied")
-        except OSError as error:
-            raise ValueError(f"{parent} cannot be written: {error.strerror}") from error
+        _make_writable(parent)
         yield partial
         done = True
     finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-        else:
-            partial.unlink(missing_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            partial.unlink()
         if not done:
             for folder in missing:
                 with suppress(OSError):
                     folder.rmdir()
+
+
+def _make_writable(folder: Path) -> None:
+    """See to it that there is such a folder; ValueError if it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "permission denied")
+    except FileExistsError:
+        raise ValueError(f"{folder} is not a folder") from None
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written: {error.strerror}") from error
 
 
 def _replace(out: Path, new: Path, old: Path, names: Sequence[str]) -> None:

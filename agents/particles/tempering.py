@@ -1,12 +1,15 @@
 """How much of a likelihood to use at once: increments that keep enough particles alive."""
 
+import math
+
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from agents.particles.cloud import effective_sample_size
 
-_BISECTIONS = 12
+_BISECTIONS = 10
+_SMALLEST = math.log(1e-9)  # of what is left: no likelihood is sharper than that
 
 
 def increment(
@@ -16,15 +19,15 @@ def increment(
     target: float,
 ) -> Float32[Tensor, "B N"]:
     """The largest share β ≤ ``left`` of the log-likelihood that keeps the effective sample size at
-    ``target`` · M, by bisection (adaptive tempering, Del Moral, Doucet & Jasra 2012)."""
+    ``target`` · M, by bisection of log β (adaptive tempering, Del Moral, Doucet & Jasra 2012)."""
     goal = target * log_weights.shape[-1]
 
     def enough(beta: Tensor) -> Tensor:
         return effective_sample_size(log_weights + beta.unsqueeze(-1) * log_likelihood) >= goal
 
-    low, high = torch.zeros_like(left), left
+    low, high = torch.full_like(left, _SMALLEST), torch.zeros_like(left)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        good = enough(middle)
+        good = enough(left * middle.exp())
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
-    return torch.where(enough(left), left, low)
+    return torch.where(enough(left), left, left * low.exp())
