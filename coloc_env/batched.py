@@ -86,12 +86,12 @@ class CoLocEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         rows = None
-        if tensordict is not None and "_reset" in tensordict.keys():
+        if tensordict is not None and "_reset" in tensordict.keys():  # noqa: SIM118
             rows = tensordict["_reset"].view(-1)
         self.world.reset(self._seeds, rows)
         moved = self._seeds + self.batch_size[0]
         self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
-        return self._observe()
+        return self._observe().copy()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]

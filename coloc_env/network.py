@@ -10,7 +10,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.sensors.base import require, squared_norm
 
-_BLOCK = 65536  # pairs of UAVs compared at once on a CPU: what stays in cache
+_BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
@@ -60,10 +60,13 @@ class Network:
             if self.walls:
                 reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
             return index, reach
-        items = (position.flatten(0, 1), alive.flatten(0, 1))
-        block = max(1, _BLOCK // (n * n)) if position.device.type == "cpu" else len(items[0])
-        parts = [self._nearest(*part) for part in zip(*(x.split(block) for x in items), strict=True)]
-        index, reach = (torch.cat(part) for part in zip(*parts, strict=True))
+        pairs = _BLOCK if position.device.type == "cpu" else alive.numel() * n
+        block = max(1, pairs // (n * n))
+        blocks = zip(
+            position.flatten(0, 1).split(block), alive.flatten(0, 1).split(block), strict=True
+        )
+        parts = zip(*(self._nearest(*part) for part in blocks), strict=True)
+        index, reach = (torch.cat(part) for part in parts)
         return index.unflatten(0, position.shape[:2]), reach.unflatten(0, position.shape[:2])
 
     def _nearest(

@@ -2,16 +2,19 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Float32
-from tensordict import TensorDict
 from torch import Tensor
 
 from coloc_env.scenario import Scenario
 from coloc_env.sensors.base import MASK, Leaf
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +42,10 @@ class Observation:
     def device(self) -> torch.device:
         return next(iter(self.leaves.values())).device
 
-    def to_tensordict(self) -> TensorDict:
+    def to_tensordict(self) -> "TensorDict":
         """The same leaves with batch size [B, N]."""
+        from tensordict import TensorDict  # takes a second, which PettingZoo's users need not wait
+
         return TensorDict(dict(self.leaves), batch_size=self.batch_size, device=self.device)
 
 

@@ -59,7 +59,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._next_seed: int | None = None
         self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
-        self._window: _Window | None = None
+        self._window: _Window
         self._renderer = None if render_mode is None else Renderer(scenario)
 
     def observation_space(self, agent: str) -> gym.spaces.Dict:
@@ -80,6 +80,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._next_seed = seed + 1
         self.agents = list(self.possible_agents)
         self.world.reset([seed])
+        self._window = _Window(self.world.sensed)
         self._tally = _Tally(len(self.agents))
         self._static = [list(leaf[0].numpy().copy()) for leaf in self.world.static.values()]
         if self._renderer is not None:
@@ -180,7 +181,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def _observe(self, agents: list[str]) -> dict[str, dict[str, np.ndarray]]:
         """Each agent's leaves: views of a window that the world never writes to again."""
         world = self.world
-        if self._window is None or world.sensed is not self._window.sensed:
+        if world.sensed is not self._window.sensed:
             self._window = _Window(world.sensed)
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]

@@ -68,7 +68,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensed(_Rows):
-    """A window of truth (float64) and leaves (float32), [R, K, N, …] each, and what ``Frame`` has."""
+    """A window: truth (float64), what a ``Frame`` has, and leaves (float32), [R, K, N, …] each."""
 
     position: Float64[Tensor, "R K N d"]
     velocity: Float64[Tensor, "R K N d"]

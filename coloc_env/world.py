@@ -49,6 +49,9 @@ class World:
     number. Nothing handed out is ever written to again.
     """
 
+    sensed: Sensed
+    _past: Past
+
     def __init__(
         self,
         scenario: Scenario,
@@ -129,17 +132,12 @@ class World:
         """Reset some rows in the middle of a window, into fresh memory."""
         if not len(rows):
             return
-        start = self.cursor
-        fresh = World(self.scenario, len(rows), self.device, self.window - start)
+        left = self.sensed.map(lambda x: x[:, self.cursor :])
+        fresh = World(self.scenario, len(rows), self.device, left.count)
         fresh.reset(seeds[rows])
 
         def merge(old: Tensor, new: Tensor) -> Tensor:
             return old.index_put((rows,), new)
-
-        def merge_window(old: Tensor, new: Tensor) -> Tensor:
-            old = old.clone()
-            old[rows, start:] = new
-            return old
 
         self.seeds = merge(self.seeds, fresh.seeds)
         self._keys = merge(self._keys, fresh._keys)
@@ -151,7 +149,7 @@ class World:
             for old, new in zip(self._placed, fresh._placed, strict=True)
         ]
         self._past = self._past.map(merge, fresh._past)
-        self.sensed = self.sensed.map(merge_window, fresh.sensed)
+        self.sensed, self.cursor = left.map(merge, fresh.sensed), 0
 
     # ---------------------------------------------------------------- sense
 

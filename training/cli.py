@@ -18,16 +18,7 @@ if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
 
 _FRAMES = 300  # at most, in an animation
-_SHOWN = (  # what fits on a terminal
-    "rmse",
-    "median",
-    "max",
-    "rmse_after_10s",
-    "diverged_runs",
-    "nees",
-    "ms_per_step",
-    "ratio_to_bound",
-)
+_TOO_WIDE = ("rmse_std", "mean", "avg_particles")  # columns left out on a terminal
 
 
 class _Plain(TyperGroup):
@@ -121,17 +112,20 @@ def evaluate(
     """
     from training.staging import staged_folder
 
-    names = split_agents(agents)
     built = _scenario(scenario, settings, threads, data)
     from training import results as files
     from training.evaluate import evaluate as run
+    from training.evaluate import split_agents
+
+    names = split_agents(agents)
 
     with staged_folder(out, files.NAMES) as folder, _progress() as tell:
         found = run(built, names, runs, seed, tell, bound=bound)
         tell("files", 0, 1)
         files.write(found, folder, figures)
         tell("files", 1, 1)
-    _show(["", *(files.COLUMNS[key] for key in _SHOWN)], files.rows(found, _SHOWN))
+    columns = {key: title for key, title in files.COLUMNS.items() if key not in _TOO_WIDE}
+    _show(["", *columns.values()], files.rows(found, columns))
     for name, one in found.agents.items():
         if one.raised:
             what = f"{name} raised in {one.raised} of {found.runs} runs; first at {one.message}"
@@ -223,18 +217,6 @@ def bench(
 # ------------------------------------------------------------------ parts
 
 
-def split_agents(text: str) -> list[str]:
-    """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
-    option before (``apf:bounds=100,800``)."""
-    names: list[str] = []
-    for piece in text.split(","):
-        if names and piece[:1] in set("0123456789+-."):
-            names[-1] += f",{piece}"
-        elif piece.strip():
-            names.append(piece.strip())
-    return names
-
-
 def _scenario(name: str, settings: list[str] | None, threads: int, data: Path | None) -> "Scenario":
     """Prepare the process, and build a scenario from a command line."""
     if threads < 1:
@@ -301,7 +283,9 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
     """Bars on stderr, one a task, where that is a terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
         tasks: dict[str, Any] = {}
 
         def tell(what: str, done: int, total: int) -> None:

@@ -36,7 +36,7 @@ def evaluate(
 
     ``progress(what, done, total)`` is called as work is done. ``bound``: compute the posterior
     bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
-    memory allows); it changes no result.
+    memory allows); no result depends on it, a localizer's own rounding aside.
 
     A run in which an agent says NaN or infinity, or raises a numerical error, goes on with the last
     finite estimates (the prior before the first) and counts as diverged.
@@ -69,6 +69,18 @@ def evaluate(
         bound=known,
         agents=results,
     )
+
+
+def split_agents(text: str) -> list[str]:
+    """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
+    option before (``apf:bounds=100,800``)."""
+    names: list[str] = []
+    for piece in text.split(","):
+        if names and piece[:1] in set("0123456789+-."):
+            names[-1] += f",{piece}"
+        elif piece.strip():
+            names.append(piece.strip())
+    return names
 
 
 def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> None:

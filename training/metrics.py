@@ -92,6 +92,12 @@ def formation_error(truth: Floats, offset: Floats, scored: Flags) -> float:
     return float(np.sqrt(total / pairs)) if pairs else float("nan")
 
 
+def per_run(values: Floats, scored: Flags) -> float:
+    """Sum over the steps of a run, mean over runs and UAVs; NaN counts as nothing."""
+    total = np.where(scored & ~np.isnan(values), values, 0.0).sum(1, dtype=np.float64)
+    return mean(total[scored.any(1)])
+
+
 def lost(error: Floats, scored: Flags, dt: float, threshold: float) -> Flags:
     """[R, N]: whether a UAV ends lost, that is, its error exceeds ``threshold`` in every one of the
     last 5 s of steps in which it is scored (all of them, if there are fewer)."""

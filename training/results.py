@@ -48,7 +48,8 @@ class AgentResult:
     ``offset`` p̂ − p [R, K, N, d] and ``error`` its length [R, K, N], m; ``nees`` [R, K, N] of the
     position, NaN where the covariance is not positive definite; ``broken`` [R]: runs with NaN,
     infinity or a numerical error, ``raised`` of them with the latter, ``message`` the first;
-    ``series``: the method's own figures [R, K, N]; ``ms_per_step`` of the whole team, B = 1.
+    ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
+    run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1.
     """
 
     offset: Floats
@@ -123,7 +124,12 @@ class Results:
         per_run = per_run[np.isfinite(per_run)]
         rmse = metrics.rmse(one.error, scored)
         bound = float("nan") if self.bound is None else self.bound.rmse
-        own = {name: metrics.mean(values[scored]) for name, values in one.series.items()}
+        own = {
+            name: metrics.per_run(values, scored)
+            if name.endswith("_per_run")
+            else metrics.mean(values[scored])
+            for name, values in one.series.items()
+        }
         figures: dict[str, Any] = {
             "rmse": rmse,
             "rmse_std": per_run.std(ddof=1) if len(per_run) > 1 else None,

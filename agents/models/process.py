@@ -11,17 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from agents.models import rotations
+from agents.models.rotations import rotate, rotate_by, rotation_between
 from coloc_env import scenario as believed_processes
-from coloc_env.geometry import (
-    concat,
-    cross_matrix,
-    quaternion_exp,
-    quaternion_matrix,
-    rotate,
-    rotate_by,
-    rotation_between,
-    rotation_matrix,
-)
+from coloc_env.geometry import concat, cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import GRAVITY, Imu, Odometry
@@ -77,7 +70,7 @@ class Process(ABC):
 
     def rotation(self, x: Float[Tensor, "*s S"]) -> Float[Tensor, "*s d d"] | None:
         """Body-to-world matrix, None where attitude is no state."""
-        return rotation_matrix(self.attitude(x)) if self.attitude_size else None
+        return rotations.matrix(self.attitude(x)) if self.attitude_size else None
 
     def attitude(self, x: Float[Tensor, "*s S"]) -> Float[Tensor, "*s a"]:
         """The attitude's part of the state."""
@@ -164,7 +157,7 @@ class InertialProcess(Process):
     ) -> tuple[Float[Tensor, "*s E E"], Float[Tensor, "*s E E"]]:
         if self.biased:
             u = u - x[..., 10:]
-        rotation = quaternion_matrix(x[..., 6:10])
+        rotation = rotations.matrix(x[..., 6:10])
         h = dt[..., None, None]
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
         f = torch.eye(self.error_size, dtype=x.dtype, device=x.device)
@@ -173,7 +166,7 @@ class InertialProcess(Process):
         f[..., :3, 3:6] = eye * h
         f[..., :3, 6:9] = 0.5 * turn * h
         f[..., 3:6, 6:9] = turn
-        f[..., 6:9, 6:9] = quaternion_matrix(quaternion_exp(-u[..., 3:] * dt.unsqueeze(-1)))
+        f[..., 6:9, 6:9] = rotations.matrix(rotations.exp(-u[..., 3:] * dt.unsqueeze(-1)))
         accel, gyro = (self.imu.accel_std * h) ** 2, (self.imu.gyro_std * h) ** 2
         q = torch.zeros_like(f)
         q[..., :3, :3] = 0.25 * accel * h**2 * eye
@@ -230,7 +223,7 @@ class WheeledProcess(Process):
         self, x: Float[Tensor, "*s 5"], u: Float[Tensor, "*s 3"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s 3 3"], Float[Tensor, "*s 3 3"]]:
         h = dt[..., None]
-        rotation = rotation_matrix(x[..., 4:])
+        rotation = rotations.matrix(x[..., 4:])
         forward = (rotation @ u[..., :2, None])[..., 0] * h
         f = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 3, 3).clone()
         f[..., 0, 2], f[..., 1, 2] = -forward[..., 1], forward[..., 0]

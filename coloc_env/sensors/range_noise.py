@@ -15,8 +15,8 @@ from coloc_env.sensors.base import require
 class RangeNoise:
     """Range = distance + noise, every number drawn from the link's own key.
 
-    - ``std``: Gaussian standard deviation in m; with probability ``tail`` it is ``tail_std`` instead
-      (a heavy-tail mixture);
+    - ``std``: Gaussian standard deviation in m; with probability ``tail`` it is ``tail_std``
+      instead (a heavy-tail mixture);
     - ``uniform``: half width in m of an added uniform error;
     - ``nlos``: probability, per link and step, of a positive bias: exponential with mean
       ``nlos_bias`` m (``nlos_kind="exponential"``) or exactly that (``"constant"``);

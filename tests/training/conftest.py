@@ -73,7 +73,8 @@ class Still(Localizer[Belief]):
         return Belief(position=position, step=belief.step + 1, batch_size=shape), estimate
 
     def diagnostics(self, belief: Belief) -> dict[str, Tensor]:
-        return {"particles": belief.step + 99.0, "calm": torch.ones(belief.batch_size)}
+        calm = torch.ones(belief.batch_size)
+        return {"particles": belief.step + 99.0, "calm": calm, "steps_per_run": calm}
 
 
 def _arrays(dim: int) -> Results:

@@ -12,7 +12,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-from training.cli import app, split_agents
+from training.cli import app
+from training.evaluate import split_agents
 from training.results import FIGURES, NAMES
 
 SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]

@@ -167,6 +167,7 @@ def test_unscored_steps_do_not_count() -> None:
     kept = [error[:, 0, 0], error[:, :8, 1], error[:, :, 2]]
     assert figures["mean"] == pytest.approx(np.concatenate([x.ravel() for x in kept]).mean())
     assert figures["diagnostics"]["calm"] == 1
+    assert figures["diagnostics"]["steps_per_run"] == pytest.approx((1 + 8 + 20) / 3)
 
 
 def test_threads_are_given_back() -> None:

@@ -1,0 +1,100 @@
+"""Quaternion algebra at both sizes that localizers need, in the conventions of ``coloc_env.geometry``.
+
+The Hamilton product and the rotation matrix are linear in the outer product of two quaternions. For
+the few states of Kalman filters one product with a constant matrix saves some thirty operations,
+whose cost is their number; for clouds of particles ``geometry``'s elementwise forms are faster.
+Results have the memory order of ``geometry.join``.
+"""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coloc_env import geometry
+from coloc_env.geometry import concat
+
+_FEW = 1024  # numbers in a tensor up to which the number of operations is what costs
+
+
+@lru_cache
+def _product_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 16"]:
+    """outer(a, b) → a ⊗ b, from the products of the basis quaternions."""
+    basis = torch.eye(4, dtype=dtype, device=device)
+    pairs = geometry.quaternion_product(
+        basis.unsqueeze(1).expand(4, 4, 4), basis.unsqueeze(0).expand(4, 4, 4)
+    )
+    return pairs.reshape(16, 4).mT.contiguous()
+
+
+@lru_cache
+def _matrix_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "9 16"]:
+    """outer(q, q) → the rotation matrix, row by row: its columns are q ⊗ e ⊗ q*."""
+    basis = torch.eye(4, dtype=dtype, device=device)
+    left = basis.unsqueeze(1).expand(4, 4, 4)
+    right = geometry.quaternion_conjugate(basis).unsqueeze(0).expand(4, 4, 4)
+    columns = []
+    for axis in (1, 2, 3):
+        turned = geometry.quaternion_product(
+            geometry.quaternion_product(left, basis[axis].expand(4, 4, 4)), right
+        )
+        columns.append(turned[..., 1:].reshape(16, 3))
+    return torch.stack(columns, -1).reshape(16, 9).mT.contiguous()
+
+
+def _bilinear(
+    matrix: Float[Tensor, "k 16"], a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]
+) -> Float[Tensor, "*s k"]:
+    outer = a.movedim(-1, 0).unsqueeze(1) * b.movedim(-1, 0).unsqueeze(0)
+    mapped = matrix @ outer.reshape(16, -1)
+    return mapped.view(-1, *outer.shape[2:]).movedim(0, -1)
+
+
+def product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
+    """Hamilton product ``a ⊗ b``."""
+    if b.numel() > _FEW:
+        return geometry.quaternion_product(a, b)
+    return _bilinear(_product_map(a.dtype, a.device), a, b)
+
+
+def matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
+    """Body-to-world matrix of a quaternion or heading."""
+    if attitude.shape[-1] == 1 or attitude.numel() > _FEW:
+        return geometry.rotation_matrix(attitude)
+    flat = _bilinear(_matrix_map(attitude.dtype, attitude.device), attitude, attitude)
+    return flat.unflatten(-1, (3, 3))
+
+
+def exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
+    """Rotation vector (rad) to unit quaternion."""
+    if v.numel() > _FEW:
+        return geometry.quaternion_exp(v)
+    half = 0.5 * torch.linalg.vector_norm(v, dim=-1, keepdim=True)
+    return concat((half.cos(), 0.5 * torch.sinc(half / torch.pi) * v))
+
+
+def rotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
+    """A body-frame vector in the world frame."""
+    if v.numel() > _FEW:
+        return geometry.rotate(attitude, v)
+    return (matrix(attitude) * v.unsqueeze(-2)).sum(-1)
+
+
+def rotate_by(
+    attitude: Float[Tensor, "*s a"], delta: Float[Tensor, "*s t"]
+) -> Float[Tensor, "*s a"]:
+    """``attitude ⊞ delta``: a right (body-frame) perturbation."""
+    if attitude.shape[-1] == 1:
+        return geometry.rotate_by(attitude, delta)
+    turned = product(attitude, exp(delta))
+    return turned / (turned * turned).sum(-1, keepdim=True).sqrt()
+
+
+def rotation_between(
+    start: Float[Tensor, "*s a"], end: Float[Tensor, "*s a"]
+) -> Float[Tensor, "*s t"]:
+    """``end ⊟ start``: the body-frame rotation vector that takes ``start`` to ``end``."""
+    if start.shape[-1] == 1:
+        return geometry.rotation_between(start, end)
+    return geometry.quaternion_log(product(geometry.quaternion_conjugate(start), end))
