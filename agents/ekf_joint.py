@@ -86,15 +86,14 @@ class JointEkf(Localizer[GaussianBelief]):
         """Iterated update of the joint state; neighbours are where the joint mean has them."""
         b, n, e = *x.shape[:2], self.process.error_size
         own = p.view(b, n, e, n, e).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-        state, updated, weights = x, p, None
+        state, updated, weights, delta = x, p, None, p[..., 0]
         for iteration in range(self.iterations):
             neighbours = self._neighbours(state)
             blocks = [m.linearize(self.process, state, observation, neighbours) for m in self.models]
             weights = weigh(self.robust, self.gate, blocks, own, weights)
             precision, vector = self._information(blocks, weights)
             if iteration:
-                moved = self.process.boxminus(state, x).flatten(1)
-                vector = vector + (precision @ moved.unsqueeze(-1))[..., 0]
+                vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
             delta, updated = posterior(p, precision, vector)
             state = self.process.boxplus(x, delta.unflatten(-1, (n, e)))
         return state, updated

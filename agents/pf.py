@@ -120,7 +120,6 @@ class ParticleFilter(Localizer[ParticleBelief]):
         particles, log_weights = self._weigh(
             particles, belief.log_weights, belief.step, observation, key
         )
-        log_weights = log_weights.log_softmax(-1)
         weights, ess = log_weights.exp(), effective_sample_size(log_weights)
         mean, apart = moments(self.process, particles, weights)
         covariance = weighted_covariance(apart, weights)
@@ -180,13 +179,14 @@ class ParticleFilter(Localizer[ParticleBelief]):
         threshold = torch.where(step < _START_STEPS, _RESAMPLE, _RESCUE) * self.particles
         staged = effective_sample_size(log_weights + gain) < threshold
         if not (self.tempering and bool(staged.any())):
-            return particles, log_weights + gain
+            return particles, (log_weights + gain).log_softmax(-1)
         left = torch.ones_like(gain[..., 0])
         for stage in range(_STAGES):
             share = left
             if stage < _STAGES - 1:
                 share = torch.where(staged, increment(log_weights, gain, left, _RESAMPLE), left)
-            log_weights = (log_weights + share.unsqueeze(-1) * gain).log_softmax(-1)
+            used = (log_weights + share.unsqueeze(-1) * gain).log_softmax(-1)
+            log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
             left = left - share
             go_on = left > 0
             if not bool(go_on.any()):

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 Parts = list[Tensor] | tuple[Tensor, ...]
-_SMALL = 1e-4  # below this angle squared the Taylor series are exact to rounding in float64
 
 
 def join(components: Parts) -> Float[Tensor, "*s n"]:
@@ -51,31 +50,26 @@ def quaternion_conjugate(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
 
 
 def quaternion_exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
-    """Rotation vector (rad) to unit quaternion; differentiable at zero."""
-    x, y, z = v.unbind(-1)
-    squared = (x * x + y * y + z * z).unsqueeze(-1)
-    small = squared < _SMALL
-    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
-    scale = torch.where(
-        small, 0.5 - squared / 48 + squared * squared / 3840, (0.5 * angle).sin() / angle
-    )
-    real = torch.where(small, 1 - squared / 8 + squared * squared / 384, (0.5 * angle).cos())
-    return concat((real, scale * v))
+    """Rotation vector (rad) to unit quaternion; exact and differentiable at zero."""
+    angle = _length(v)
+    half = 0.5 * angle
+    return concat((half.cos(), half.sin() / angle * v))
 
 
 def quaternion_log(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3"]:
     """Unit quaternion to the rotation vector of angle at most π; differentiable at identity."""
-    w, x, y, z = q.unbind(-1)
-    real = w.abs()
+    q = torch.where(q[..., :1] < 0, -q, q)
+    real, imaginary = q[..., :1], q[..., 1:]
+    sine = _length(imaginary)
+    return 4 * torch.atan(sine / (real + 1)) / sine * imaginary
+
+
+def _length(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 1"]:
+    """Norm that never is zero: the least positive number under the root keeps sin(x)/x and its
+    gradient finite at zero and changes nothing elsewhere."""
+    x, y, z = v.unbind(-1)
     squared = x * x + y * y + z * z
-    small = squared < _SMALL
-    ratio = squared / (real * real)
-    sine = torch.where(small, 1.0, squared).sqrt()
-    scale = torch.where(
-        small, 2 / real * (1 - ratio / 3 + ratio * ratio / 5), 4 * torch.atan(sine / (1 + real)) / sine
-    )
-    scale = torch.where(w < 0, -scale, scale)
-    return torch.stack((scale * x, scale * y, scale * z), -1)
+    return (squared + torch.finfo(v.dtype).tiny).sqrt().unsqueeze(-1)
 
 
 def quaternion_matrix(q: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 3 3"]:

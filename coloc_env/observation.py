@@ -125,7 +125,7 @@ def action_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
 def action_space(scenario: Scenario) -> gym.spaces.Box:
     """One UAV's action ``[position, velocity, log-std]``."""
     low, high = action_bounds(scenario)
-    return gym.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
 def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
@@ -143,7 +143,7 @@ def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
 def state_space(scenario: Scenario) -> gym.spaces.Box:
     """The privileged truth of the whole team, flat and bounded."""
     low, high = state_bounds(scenario)
-    return gym.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
 def stack(observations: Iterable[Mapping[str, np.ndarray]]) -> Observation:

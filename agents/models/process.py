@@ -121,6 +121,7 @@ class InertialProcess(Process):
         self.imu, self.settings = imu, settings
         self.biased = bool(settings.accel_bias or settings.gyro_bias)
         self.state_size, self.error_size = (16, 15) if self.biased else (10, 9)
+        self.fixed, self.added = self._constants()
 
     def _initial(
         self, mean: Float[Tensor, "*s 10"], std: Float[Tensor, "*s 9"]
@@ -158,27 +159,33 @@ class InertialProcess(Process):
         if self.biased:
             u = u - x[..., 10:]
         rotation = rotations.matrix(x[..., 6:10])
-        h = dt[..., None, None]
-        eye = torch.eye(3, dtype=x.dtype, device=x.device)
-        f = torch.eye(self.error_size, dtype=x.dtype, device=x.device)
-        f = f.expand(*x.shape[:-1], -1, -1).clone()
+        h, moving = dt[..., None, None], (dt > 0)[..., None, None]
+        still = torch.eye(self.error_size, dtype=x.dtype, device=x.device)
+        f = torch.where(moving, self.fixed.to(x), still)
         turn = -rotation @ cross_matrix(u[..., :3]) * h
-        f[..., :3, 3:6] = eye * h
         f[..., :3, 6:9] = 0.5 * turn * h
         f[..., 3:6, 6:9] = turn
         f[..., 6:9, 6:9] = rotations.matrix(rotations.exp(-u[..., 3:] * dt.unsqueeze(-1)))
-        accel, gyro = (self.imu.accel_std * h) ** 2, (self.imu.gyro_std * h) ** 2
-        q = torch.zeros_like(f)
-        q[..., :3, :3] = 0.25 * accel * h**2 * eye
-        q[..., :3, 3:6] = q[..., 3:6, :3] = 0.5 * accel * h * eye
-        q[..., 3:6, 3:6] = accel * eye
-        q[..., 6:9, 6:9] = gyro * eye
         if self.biased:
             f[..., :3, 9:12] = -0.5 * rotation * h**2
             f[..., 3:6, 9:12] = -rotation * h
-            f[..., 6:9, 12:15] = -eye * h
-            q[..., 9:12, 9:12] = self.settings.accel_walk**2 * h * eye
-            q[..., 12:15, 12:15] = self.settings.gyro_walk**2 * h * eye
+        return f, self.added.to(x) * moving
+
+    def _constants(self) -> tuple[Float[Tensor, "E E"], Float[Tensor, "E E"]]:
+        """The parts of F and Q over one step that no state changes."""
+        h, e = self.dt, self.error_size
+        f, q = torch.eye(e, dtype=torch.float64), torch.zeros(e, e, dtype=torch.float64)
+        eye = torch.eye(3, dtype=torch.float64)
+        f[:3, 3:6] = h * eye
+        accel, gyro = (self.imu.accel_std * h) ** 2, (self.imu.gyro_std * h) ** 2
+        q[:3, :3] = 0.25 * accel * h**2 * eye
+        q[:3, 3:6] = q[3:6, :3] = 0.5 * accel * h * eye
+        q[3:6, 3:6] = accel * eye
+        q[6:9, 6:9] = gyro * eye
+        if self.biased:
+            f[6:9, 12:15] = -h * eye
+            q[9:12, 9:12] = self.settings.accel_walk**2 * h * eye
+            q[12:15, 12:15] = self.settings.gyro_walk**2 * h * eye
         return f, q
 
 

@@ -54,14 +54,13 @@ def iterated_update(
 
     ``weigh`` gives each iteration's weights from its blocks and the last iteration's weights.
     """
-    state, updated, weights = x, covariance, None
+    state, updated, weights, delta = x, covariance, None, covariance[..., 0]
     for iteration in range(iterations):
         blocks = linearize(state)
         weights = weigh(blocks, weights)
         precision, vector = information(blocks, weights)
-        if iteration:
-            from_prior = process.boxminus(state, x)
-            vector = vector + (precision @ from_prior.unsqueeze(-1))[..., 0]
+        if iteration:  # residuals are about state = x ⊞ δ: refer them to the prior
+            vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
         delta, updated = posterior(covariance, precision, vector)
         state = process.boxplus(x, delta)
     return state, updated

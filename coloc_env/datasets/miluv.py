@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml  # type: ignore[import-untyped]
+import yaml
 
 from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
 from coloc_env.datasets.recording import (

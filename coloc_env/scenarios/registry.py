@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from coloc_env import options
@@ -36,7 +37,7 @@ def make_scenario(name: str, **overrides: Any) -> Scenario:
     """
     options.check(name, overrides, overrides_of(name))
     try:
-        return FAMILIES[name](**overrides)
+        return replace(FAMILIES[name](**overrides), overrides=overrides)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
