@@ -102,8 +102,10 @@ def plane_angle(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor,
     torch's atan2 rounds differently in vectorized bodies and tails, which would make a number
     depend on the batch it is computed in; atan does not.
     """
-    half_turn = torch.where(y < 0, -torch.pi, torch.pi)
-    return torch.atan(y / x) + torch.where(x < 0, half_turn, torch.zeros_like(half_turn))
+    slope = torch.where(y == 0, y, y / x.abs())  # of the half-plane x ≥ 0; 0 at the origin
+    half_turn = torch.pi * (1 - 2 * (y < 0).to(y.dtype))
+    angle = torch.atan(slope)
+    return torch.where(x < 0, half_turn - angle, angle)
 
 
 def wrap_angle(angle: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:

@@ -98,7 +98,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     ]:
         """Score the estimates of the step observed last, then move to the next.
 
-        Raises ValueError for a missing or unknown agent, a wrong shape, NaN or infinity.
+        Raises ValueError for a missing or unknown agent, a wrong shape, NaN or infinity. Actions
+        of UAVs that have failed are ignored (TorchRL's ``PettingZooWrapper`` goes on sending them).
         """
         if not self.agents:
             raise ValueError(f"{self.scenario.name}: the episode is over; call reset() first")
@@ -126,51 +127,60 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
 
     def state(self) -> np.ndarray:
         """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
-        return self.world.state()[0].numpy()
+        self._started()
+        return self.world.state().numpy()[0]
 
     def render(self) -> np.ndarray | None:
         """The scene now: an RGB array [H, W, 3] uint8, or a window (``human``)."""
         if self.render_mode is None or self._renderer is None:
-            raise ValueError("render() needs render_mode='rgb_array' or 'human' and a reset()")
+            raise ValueError(f"render() needs a render_mode: {' or '.join(RENDER_MODES)}")
+        self._started()
         return self._renderer.render(self.world, self.render_mode)
 
     def close(self) -> None:
         """Close the window, if any."""
         if self._renderer is not None:
             self._renderer.close()
-            self._renderer = None
 
     # ------------------------------------------------------------------ inner
 
+    def _started(self) -> None:
+        if self.world.cursor < 0:
+            raise ValueError(f"{self.scenario.name}: call reset() first")
+
     def _estimates_of(self, actions: Mapping[str, np.ndarray]) -> torch.Tensor:
         """Actions as one tensor [1, N, A]; a failed UAV's slot is zero."""
-        name, agents = self.scenario.name, self.agents
-        if actions.keys() != set(agents):
+        agents, count = self.agents, len(self.possible_agents)
+        if not (actions.keys() >= set(agents) and actions.keys() <= self._index.keys()):
             missing = [a for a in agents if a not in actions]
-            unknown = [a for a in actions if a not in agents]
-            what = f"no action for {missing[0]}" if missing else f"{unknown[0]!r} is not acting"
-            raise ValueError(f"{name}: {what}; agents now: {', '.join(agents)}")
+            unknown = [a for a in actions if a not in self._index]
+            what = f"no action for {missing[0]}" if missing else f"there is no agent {unknown[0]!r}"
+            raise ValueError(f"{self.scenario.name}: {what}; acting now: {', '.join(agents)}")
         try:
             stacked = np.array([[actions[a] for a in agents]], dtype=np.float32)
-            fits = stacked.shape == (1, len(agents), self._width)
         except (TypeError, ValueError):
-            fits = False
-        if not fits:
-            wrong = next((a for a in agents if np.shape(actions[a]) != (self._width,)), agents[0])
-            raise ValueError(
-                f"{name}: the action of {wrong} has shape {np.shape(actions[wrong])}; "
-                f"({self._width},) is needed: [position, velocity, log-std]"
-            )
-        if not np.isfinite(stacked).all():
-            wrong = agents[int(np.flatnonzero(~np.isfinite(stacked[0]).all(1))[0])]
-            raise ValueError(
-                f"{name}: the action of {wrong} holds NaN or infinity; every number must be finite"
-            )
-        if len(agents) < len(self.possible_agents):
-            every = np.zeros((1, len(self.possible_agents), self._width), np.float32)
-            every[0, [self._index[a] for a in agents]] = stacked[0]
-            stacked = every
+            raise self._wrong(actions) from None
+        if stacked.shape != (1, len(agents), self._width) or not np.isfinite(stacked).all():
+            raise self._wrong(actions)
+        if len(agents) < count:
+            acting, stacked = stacked, np.zeros((1, count, self._width), np.float32)
+            stacked[0, [self._index[a] for a in agents]] = acting[0]
         return torch.from_numpy(stacked)
+
+    def _wrong(self, actions: Mapping[str, np.ndarray]) -> ValueError:
+        """The error that names the first action that does not fit, and what does."""
+        needed = f"({self._width},) finite numbers are needed: [position, velocity, log-std]"
+        for agent in self.agents:
+            what = f"{self.scenario.name}: the action of {agent}"
+            try:
+                action = np.asarray(actions[agent], dtype=np.float32)
+            except (TypeError, ValueError):
+                return ValueError(f"{what} is not numeric; {needed}")
+            if action.shape != (self._width,):
+                return ValueError(f"{what} has shape {action.shape}; {needed}")
+            if not np.isfinite(action).all():
+                return ValueError(f"{what} holds NaN or infinity; {needed}")
+        raise AssertionError("every action fits")
 
     def _of(self, agents: list[str], every: list[T]) -> dict[str, T]:
         """The entries of some agents from a list of all."""

@@ -24,6 +24,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
 
 _AGENT_STEPS = 6144  # (row, step, UAV) items sensed at once: what stays in cache
+_NEVER = 1 << 62
 _LONGEST = 256  # steps sensed ahead at most: what comes of a shorter episode is thrown away
 
 
@@ -116,17 +117,17 @@ class World:
                 self._static[name] = value.unsqueeze(1).expand(-1, n, -1).contiguous()
 
     def _failures(self, keys: Int64[Tensor, "R"]) -> Int64[Tensor, "R N"]:
-        """The step at which each UAV fails; beyond the horizon if it does not."""
+        """The step at which each UAV fails; one that is never reached if it does not."""
         scenario = self.scenario
         n, horizon = scenario.arena.n_uavs, scenario.horizon
-        never = torch.full((len(keys), n), horizon + 1, device=keys.device)
+        fails_at = torch.full((len(keys), n), _NEVER, device=keys.device)
         if scenario.failure_rate:
             fails, when = noise.uniform(keys, "failure", 2 * n).unflatten(-1, (2, n)).unbind(1)
             at = 1 + (when * (horizon - 1)).to(torch.int64)
-            never = torch.where(fails < scenario.failure_rate, at, never)
+            fails_at = torch.where(fails < scenario.failure_rate, at, fails_at)
         for uav, step in scenario.failures:
-            never[:, uav] = step
-        return never
+            fails_at[:, uav] = step
+        return fails_at
 
     def _reset_rows(self, seeds: Int64[Tensor, "B"], rows: Int64[Tensor, "r"]) -> None:
         """Reset some rows in the middle of a window, into fresh memory."""

@@ -21,6 +21,7 @@ from coloc_env.sensors import (
     LandmarkBearings,
     Landmarks,
     Ranging,
+    SlowFlight,
     UavBearings,
 )
 from coloc_env.sensors.ranging import Tags
@@ -373,6 +374,32 @@ class Heights(Measurement):
         )
 
 
+class Slowness(Measurement):
+    """Velocity about zero."""
+
+    def __init__(self, sensor: SlowFlight) -> None:
+        self.variance = sensor.std**2
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        d = process.dim
+        residual = -x[..., None, d : 2 * d]
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
+        jacobian[..., d : 2 * d] = torch.eye(d, dtype=x.dtype, device=x.device)
+        return Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=x.new_tensor(self.variance).expand_as(residual),
+            mask=torch.ones(residual.shape[:-1], dtype=torch.bool, device=x.device),
+        )
+
+
 def make_measurements(believed: Believed) -> list[Measurement]:
     """A model for every believed sensor that measures position, attitude or other UAVs."""
     models: list[Measurement] = []
@@ -389,4 +416,6 @@ def make_measurements(believed: Believed) -> list[Measurement]:
             models.append(UavRangeBearings(sensor))
         elif isinstance(sensor, Height):
             models.append(Heights(sensor))
+        elif isinstance(sensor, SlowFlight):
+            models.append(Slowness(sensor))
     return models

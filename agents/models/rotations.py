@@ -1,8 +1,8 @@
 """Quaternion algebra at both sizes that localizers need, in the conventions of ``coloc_env.geometry``.
 
 The Hamilton product and the rotation matrix are linear in the outer product of two quaternions. For
-the few states of Kalman filters one product with a constant matrix saves some thirty operations,
-whose cost is their number; for clouds of particles ``geometry``'s elementwise forms are faster.
+the states of Kalman filters one product with a constant matrix saves some thirty operations, whose
+cost is their number; for clouds of particles ``geometry``'s elementwise forms are faster.
 Results have the memory order of ``geometry.join``.
 """
 
@@ -15,7 +15,9 @@ from torch import Tensor
 from coloc_env import geometry
 from coloc_env.geometry import concat
 
-_FEW = 1024  # numbers in a tensor up to which the number of operations is what costs
+# States have these dimensions (B, N, k), clouds more. The batch's size must not decide: both forms
+# round differently, and a row's numbers would depend on who else is in the batch.
+_STATES = 3
 
 
 @lru_cache
@@ -53,14 +55,14 @@ def _bilinear(
 
 def product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
     """Hamilton product ``a ⊗ b``."""
-    if b.numel() > _FEW:
+    if b.dim() > _STATES:
         return geometry.quaternion_product(a, b)
     return _bilinear(_product_map(a.dtype, a.device), a, b)
 
 
 def matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
     """Body-to-world matrix of a quaternion or heading."""
-    if attitude.shape[-1] == 1 or attitude.numel() > _FEW:
+    if attitude.shape[-1] == 1 or attitude.dim() > _STATES:
         return geometry.rotation_matrix(attitude)
     flat = _bilinear(_matrix_map(attitude.dtype, attitude.device), attitude, attitude)
     return flat.unflatten(-1, (3, 3))
@@ -68,7 +70,7 @@ def matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
 
 def exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
     """Rotation vector (rad) to unit quaternion."""
-    if v.numel() > _FEW:
+    if v.dim() > _STATES:
         return geometry.quaternion_exp(v)
     half = 0.5 * torch.linalg.vector_norm(v, dim=-1, keepdim=True)
     return concat((half.cos(), 0.5 * torch.sinc(half / torch.pi) * v))
@@ -76,7 +78,7 @@ def exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
 
 def rotate(attitude: Float[Tensor, "*s a"], v: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:
     """A body-frame vector in the world frame."""
-    if v.numel() > _FEW:
+    if v.dim() > _STATES:
         return geometry.rotate(attitude, v)
     return (matrix(attitude) * v.unsqueeze(-2)).sum(-1)
 

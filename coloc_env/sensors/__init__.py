@@ -8,6 +8,7 @@ from coloc_env.sensors.landmarks import Landmarks
 from coloc_env.sensors.odometry import Odometry
 from coloc_env.sensors.range_noise import RangeNoise
 from coloc_env.sensors.ranging import AnchorRanging, Ranging
+from coloc_env.sensors.slow_flight import SlowFlight
 
 __all__ = [
     "GRAVITY",
@@ -23,6 +24,7 @@ __all__ = [
     "Ranging",
     "Recorded",
     "Sensor",
+    "SlowFlight",
     "UavBearings",
     "Window",
 ]

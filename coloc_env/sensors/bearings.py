@@ -66,11 +66,11 @@ class LandmarkBearings(Sensor):
         white = noise.normal(window.keys, "bearings", 2 * n * slots).unflatten(-1, (n, slots, 2))
         drawn = noise.uniform(window.keys, "bearings.share", n * slots).unflatten(-1, (n, slots))
         mask = (squared_norm(apart) <= self.radius**2) & (drawn < self.share)
-        visible = (mask & window.alive.unsqueeze(-1)).to(torch.float32)
+        mask &= window.alive.unsqueeze(-1)
         seen = range_bearing(apart, (self.range_std, self.bearing_std), white)
         return {
-            "landmark_bearings": (seen * visible.unsqueeze(-1)).flatten(-2),
-            "landmark_bearing_mask": visible,
+            "landmark_bearings": seen.masked_fill_(~mask.unsqueeze(-1), 0.0).flatten(-2),
+            "landmark_bearing_mask": mask.to(torch.float32),
         }
 
 
@@ -105,10 +105,10 @@ class UavBearings(Sensor):
         mask = window.reach.repeat(1, 1, 1, self.depth) & (
             drawn.unflatten(-1, (n, count)) < self.share
         )
-        visible = mask.to(torch.float32)
         std = (self.range_std, self.bearing_std)
         seen = range_bearing(apart, std, white.unflatten(-1, (n, count, 2)))
         return {
-            "uav_bearings": (seen * visible.unsqueeze(-1)).flatten(-2),
-            "uav_bearing_mask": visible,
+            # Filled, not multiplied: the bearing to oneself is NaN.
+            "uav_bearings": seen.masked_fill_(~mask.unsqueeze(-1), 0.0).flatten(-2),
+            "uav_bearing_mask": mask.to(torch.float32),
         }

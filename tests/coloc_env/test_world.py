@@ -1,6 +1,8 @@
-"""The batched world: every row is the world of its own seed, and nothing handed out ever changes."""
+"""The batched world: each row is the world of its seed, and nothing handed out ever changes."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -146,9 +148,9 @@ def test_rows_reset_alone_at_any_moment(
     seeds = list(range(size))
     batch = list(play(scenario, seeds, steps, window, resets))
     for row in range(size):
-        starts = [0] + sorted(k for k in resets if resets[k][0][row] and k > 0) + [steps]
+        starts = [0, *sorted(k for k in resets if resets[k][0][row] and k > 0), steps]
         first = resets[0][1][row] if 0 in resets and resets[0][0][row] else seeds[row]
-        for begin, end in zip(starts, starts[1:], strict=False):
+        for begin, end in pairwise(starts):
             seed = resets[begin][1][row] if begin > 0 else first
             for j, alone in enumerate(play(scenario, [seed], end - begin)):
                 # What was scored before an episode's first step belongs to the episode before.
@@ -281,7 +283,7 @@ def test_a_failed_uav_is_silent_unscored_and_stays_so() -> None:
         terminated = torch.zeros(8, 6, dtype=torch.int64)
         sensed = ("imu", "landmarks", "landmark_mask", "ranges", "range_mask", "links")
         for k in range(10):
-            before, alive = world.alive, torch.ones(8, 6, dtype=torch.bool)
+            before = world.alive
             step = world.step(torch.ones(8, 6, 9))
             assert torch.equal(step.scored, before)
             assert ((step.reward == 0) == ~before).all()
@@ -301,13 +303,13 @@ def test_a_failed_uav_is_silent_unscored_and_stays_so() -> None:
 
 
 def test_failures_at_given_steps() -> None:
-    import dataclasses
-
     scenario = dataclasses.replace(make_scenario("indoor-v0"), failures=((2, 3), (4, 1)))
     world = World(scenario, 2)
     world.reset(0)
-    failed = [world.step(torch.zeros(2, 6, 9)).terminated[0].nonzero().flatten().tolist()
-              for _ in range(5)]
+    failed = [
+        world.step(torch.zeros(2, 6, 9)).terminated[0].nonzero().flatten().tolist()
+        for _ in range(5)
+    ]
     assert failed == [[4], [], [2], [], []]
 
 

@@ -1,0 +1,205 @@
+"""What localizers are tested on: runs of small scenarios, recorded once for all tests."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from agents import LOCALIZERS, Estimate, Localizer, make, options_of
+from coloc_env.motion import Aggressive, Arena, RandomVelocity
+from coloc_env.network import Network
+from coloc_env.observation import Observation
+from coloc_env.scenario import Inertial, Prior, Process, Scenario, Wheeled
+from coloc_env.scenarios import make_scenario
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Imu,
+    LandmarkBearings,
+    Odometry,
+    Ranging,
+    Sensor,
+    UavBearings,
+)
+from coloc_env.world import World
+
+SEEDS, STEPS, PARTICLES = (3, 4, 5), 6, 64
+TAGS = (((0.2, 0.1, -0.1), (-0.3, 0.0, 0.1)),) * 3
+CORNERS = ((0.0, 0.0, 0.0), (10.0, 8.0, 4.0), (0.0, 8.0, 1.0), (10.0, 0.0, 3.0))
+
+
+def custom(dim: int, n: int, process: Process, sensors: tuple[Sensor, ...]) -> Scenario:
+    """A scenario that no family has, in a box of 10 × 8 × 4 m."""
+    return Scenario(
+        name="custom",
+        arena=Arena(dim, n, 0.1, (0.0,) * dim, (10.0, 8.0, 4.0)[:dim]),
+        horizon=400,
+        motion=Aggressive() if dim == 3 else RandomVelocity(),
+        sensors=sensors,
+        network=Network(),
+        prior=Prior(position_std=0.5, velocity_std=0.1),
+        process=process,
+        believed_sensors=sensors,
+    )
+
+
+def plane() -> Scenario:
+    bearings = LandmarkBearings(count=6, radius=20.0, share=0.8, depth=2)
+    return custom(2, 4, Wheeled(), (Odometry(), bearings, UavBearings(share=0.7)))
+
+
+def tags() -> Scenario:
+    anchors, ranging = AnchorRanging(CORNERS, tags=TAGS), Ranging(tags=TAGS)
+    return custom(3, 3, Inertial(), (Imu(), anchors, ranging, Height()))
+
+
+def indoor(**overrides: Any) -> Callable[[], Scenario]:
+    return lambda: make_scenario("indoor-v0", **overrides)
+
+
+FAMILIES: dict[str, Callable[[], Scenario]] = {
+    "default": indoor(),
+    "nlos": indoor(nlos=0.3),
+    "few": indoor(landmarks=4),
+    "uniform": indoor(prior="uniform"),
+    "imu_bias": indoor(imu_bias=True),
+    "anchors": indoor(imu=False, landmarks=0, anchors=8),
+    "slots": indoor(n_uavs=20),
+    "plane": plane,
+    "tags": tags,
+}
+VARIANTS = (
+    "ekf:robust=huber",
+    "ekf:robust=gate",
+    "ekf:fusion=ci",
+    "ekf_joint:robust=huber",
+    "pf500:perturb=fixed:tempering=false",
+)
+REFUSED = {("ekf_joint", "slots")}
+CASES = [
+    *((name, family) for name in LOCALIZERS for family in FAMILIES if (name, family) not in REFUSED),
+    *((name, family) for name in VARIANTS for family in ("default", "plane")),
+]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Beliefs before each step and after the last, and what each step was given and said."""
+
+    observations: Sequence[Observation]
+    beliefs: Sequence[Any]
+    estimates: Sequence[Estimate]
+
+    @property
+    def position(self) -> Tensor:
+        """[K, B, N, d]"""
+        return torch.stack([e.position for e in self.estimates])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A localizer and its run of ``STEPS`` steps in worlds ``SEEDS`` of a scenario."""
+
+    name: str
+    family: str
+    scenario: Scenario
+    localizer: Localizer
+    run: Run
+
+
+def build(name: str, scenario: Scenario) -> Localizer:
+    """The localizer, with few particles if it has any."""
+    few = {"particles": PARTICLES} if "particles" in options_of(name.split(":")[0]) else {}
+    return make(name, scenario, **few)
+
+
+def play(localizer: Localizer, scenario: Scenario, seeds: Iterable[int], steps: int) -> Run:
+    """A run in which the UAVs send their estimates as messages."""
+    seeds = torch.tensor(list(seeds))
+    world = World(scenario, len(seeds))
+    observation = world.reset(seeds)
+    run = Run([], [localizer.reset(observation)], [])
+    for _ in range(steps):
+        belief, estimate = localizer.step(run.beliefs[-1], observation)
+        run.observations.append(observation)
+        run.beliefs.append(belief)
+        run.estimates.append(estimate)
+        world.advance(estimate.action())
+        observation = world.observation()
+    return run
+
+
+def replay(localizer: Localizer, observations: Sequence[Observation]) -> Run:
+    """A run on observations that do not answer to it."""
+    run = Run(observations, [localizer.reset(observations[0])], [])
+    for observation in observations:
+        belief, estimate = localizer.step(run.beliefs[-1], observation)
+        run.beliefs.append(belief)
+        run.estimates.append(estimate)
+    return run
+
+
+def change(observation: Observation, **leaves: Tensor) -> Observation:
+    """The observation with some leaves replaced."""
+    return Observation({**observation.leaves, **leaves})
+
+
+def masked_pairs(observation: Observation) -> dict[str, str]:
+    """Value leaf of each mask leaf."""
+    pairs = {}
+    for name in observation.leaves:
+        if name.endswith("_mask"):
+            stem = name.removesuffix("_mask")
+            pairs[name] = stem if stem in observation else f"{stem}s"
+    return pairs
+
+
+def behind(observation: Observation, mask: str, value: float) -> Tensor:
+    """The value leaf of ``mask`` with ``value`` wherever the mask is 0."""
+    leaf, seen = observation[masked_pairs(observation)[mask]], observation[mask]
+    entries = leaf.unflatten(-1, (seen.shape[-1], -1))
+    return entries.masked_fill(seen.unsqueeze(-1) == 0, value).flatten(-2)
+
+
+def assert_same(found: Any, expected: Any, tolerance: float = 0.0) -> None:
+    """Every tensor of two tensorclasses agrees, exactly unless a tolerance is given."""
+    ours, theirs = (x.to_tensordict().flatten_keys(".") for x in (found, expected))
+    assert set(ours.keys()) == set(theirs.keys())
+    for name, value in ours.items():
+        torch.testing.assert_close(
+            value, theirs[name], rtol=tolerance, atol=tolerance, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+@lru_cache(maxsize=None)
+def recorded(name: str, family: str) -> Case:
+    scenario = FAMILIES[family]()
+    localizer = build(name, scenario)
+    return Case(name, family, scenario, localizer, play(localizer, scenario, SEEDS, STEPS))
+
+
+@pytest.fixture(params=CASES, ids="-".join)
+def case(request: pytest.FixtureRequest) -> Case:
+    """Every localizer in every family of scenarios that it takes."""
+    return recorded(*request.param)
+
+
+@pytest.fixture
+def tools() -> SimpleNamespace:
+    """Running localizers and changing what they see."""
+    return SimpleNamespace(
+        build=build,
+        play=play,
+        replay=replay,
+        change=change,
+        behind=behind,
+        masked_pairs=masked_pairs,
+        assert_same=assert_same,
+        families=FAMILIES,
+        custom=custom,
+    )

@@ -1,0 +1,252 @@
+"""Scenario families: every override works, every wrong one is named, believed is not true."""
+
+import inspect
+import typing
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from coloc_env.motion import MOTIONS
+from coloc_env.observation import all_leaves, observation_space, state_space
+from coloc_env.scenario import ConstantVelocity, Inertial, Prior
+from coloc_env.scenarios import FAMILIES, make_scenario, overrides_of, parse_override
+from coloc_env.sensors import AnchorRanging, Imu, Landmarks, RangeNoise, Ranging
+from coloc_env.world import World
+
+# One value other than the default for every override of indoor-v0.
+CHANGED: dict[str, Any] = {
+    "n_uavs": 3,
+    "room": (20.0, 15.0, 4.0),
+    "dt": 0.05,
+    "horizon": 17,
+    "motion": "helix",
+    "landmarks": 7,
+    "landmark_std": 0.5,
+    "landmark_radius": 4.0,
+    "false_matches": 0.5,
+    "landmark_dropout": 0.5,
+    "range_only": (0.0, 1.0),
+    "uwb": False,
+    "uwb_std": 0.7,
+    "nlos": 0.5,
+    "nlos_bias": 2.0,
+    "uwb_tail": 0.5,
+    "uwb_tail_std": 3.0,
+    "uwb_uniform": 0.5,
+    "uwb_impulse": 0.5,
+    "uwb_dropout": 0.5,
+    "uwb_delay": 1,
+    "anchors": 3,
+    "accel_std": 0.4,
+    "gyro_std": 0.3,
+    "imu": False,
+    "imu_bias": True,
+    "accel_bias": 0.9,
+    "gyro_bias": 0.9,
+    "comm_radius": 3.0,
+    "max_neighbours": 2,
+    "message_loss": 0.5,
+    "message_delay": 1,
+    "walls": (14.0, 9.0, 0.0, 16.0, 11.0, 5.0),
+    "prior": "uniform",
+    "prior_std": 9.0,
+    "failure_rate": 1.0,
+    "reward": "squared",
+    "believed_uwb_std": 0.9,
+    "believed_imu_bias": True,
+}
+# Overrides that show only together with another.
+WITH: dict[str, dict[str, Any]] = {
+    "nlos_bias": {"nlos": 0.5},
+    "uwb_tail_std": {"uwb_tail": 0.5},
+    "accel_bias": {"imu_bias": True},
+    "gyro_bias": {"imu_bias": True},
+    "failure_rate": {"horizon": 4},
+}
+
+
+def told(**overrides: Any) -> tuple[Any, ...]:
+    """All that one world does in four steps, and what its team believes."""
+    scenario = make_scenario("indoor-v0", **overrides)
+    world = World(scenario, 1)
+    seen, brought = world.reset(0), []
+    for _ in range(4):
+        step = world.step(torch.ones(1, scenario.arena.n_uavs, 9))
+        brought.append(
+            {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
+        )
+        seen = world.observation()
+    return brought, scenario.horizon, scenario.believed
+
+
+def test_every_override_is_tried() -> None:
+    assert set(CHANGED) == set(overrides_of("indoor-v0"))
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_every_override_changes_something(name: str) -> None:
+    others = WITH.get(name, {})
+    assert told(**others) != told(**others, **{name: CHANGED[name]})
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_every_override_is_read_from_the_command_line(name: str) -> None:
+    value = CHANGED[name]
+    text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    assert parse_override("indoor-v0", f"{name}={text}") == (name, value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"n_uav": 3}, r"unknown option 'n_uav' \(did you mean 'n_uavs'\?\); known: n_uavs, room"),
+        ({"n_uavs": 2.5}, "n_uavs=2.5 is not allowed: a whole number is needed"),
+        ({"n_uavs": True}, "n_uavs=True is not allowed: a whole number is needed"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: at least one UAV"),
+        ({"nlos": 1.5}, "nlos=1.5 is not allowed: a probability"),
+        ({"nlos": float("nan")}, "nlos=nan is not allowed: a number is needed"),
+        ({"uwb_std": -0.1}, "std=-0.1 is not allowed: a size in m"),
+        ({"motion": "hover"}, "motion='hover' is not allowed: one of circle, line"),
+        ({"room": (30.0, 20.0)}, "room=.* is not allowed: 3 numbers"),
+        ({"dt": 0.0}, r"dt \(s\) and the room's sides \(m\) must be > 0"),
+        ({"horizon": 0}, "horizon=0 is not allowed: at least one step"),
+        ({"reward": "best"}, "reward='best' is not allowed: one of error, squared, team, log_sc"),
+        ({"prior": "none"}, "kind='none' is not allowed: one of gaussian, uniform"),
+        ({"failure_rate": 2.0}, "failure_rate=2.0 is not allowed: a probability"),
+        ({"comm_radius": -1.0}, "radius=-1.0 is not allowed: a distance in m > 0"),
+        ({"walls": (1.0, 2.0)}, "walls=.* is not allowed: six numbers a box"),
+        ({"anchors": 99}, "anchors.* is not allowed: at most 16"),
+        ({"landmarks": -1}, "landmarks and anchors are counts ≥ 0"),
+        ({"uwb_delay": -1}, "latency=-1 is not allowed: a number of steps"),
+    ],
+)
+def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        make_scenario("indoor-v0", **overrides)
+    assert str(caught.value).startswith("indoor-v0: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_scenarios_are_named() -> None:
+    with pytest.raises(
+        ValueError, match=r"unknown scenario 'indoors-v0' \(did you mean 'indoor-v0"
+    ):
+        make_scenario("indoors-v0")
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_families_take_keywords_with_types_and_say_what_they_are(name: str) -> None:
+    family = FAMILIES[name]
+    kinds = {p.kind for p in inspect.signature(family).parameters.values()}
+    assert kinds <= {inspect.Parameter.KEYWORD_ONLY}
+    assert family.__doc__
+    for option, parameter in overrides_of(name).items():
+        assert parameter.annotation is not inspect.Parameter.empty, option
+        assert parameter.default is not inspect.Parameter.empty, option
+        typing.get_args(parameter.annotation)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_every_motion_flies_indoors(motion: str) -> None:
+    world = World(make_scenario("indoor-v0", motion=motion), 8)
+    world.reset(0)
+    room = torch.tensor([30.0, 20.0, 5.0], dtype=torch.float64)
+    for _ in range(100):
+        position = world.truth.position
+        assert (position >= 0).all()
+        assert (position <= room).all()
+        world.advance(torch.zeros(8, 6, 9))
+
+
+def test_indoor_is_as_published() -> None:
+    scenario = make_scenario("indoor-v0")
+    assert scenario.agents == [f"uav_{i}" for i in range(6)]
+    assert (scenario.arena.dt, scenario.horizon) == (0.1, 1000)
+    assert scenario.sensors == (Imu(), Landmarks(), Ranging(RangeNoise(std=0.2)))
+    assert scenario.believed.sensors == scenario.sensors
+    assert scenario.believed.process == Inertial()
+    assert scenario.believed.slots == 6
+
+
+def test_what_is_believed_is_not_what_is_true() -> None:
+    contaminated = make_scenario(
+        "indoor-v0", nlos=0.3, uwb_tail=0.1, false_matches=0.2, landmark_dropout=0.1, imu_bias=True
+    )
+    plain = make_scenario("indoor-v0", believed_imu_bias=True)
+    assert contaminated.believed.sensors == plain.believed.sensors
+    assert contaminated.sensors != plain.sensors
+    assert contaminated.believed.process == Inertial(0.1, 0.01)
+    unsuspecting = make_scenario("indoor-v0", imu_bias=True, believed_imu_bias=False)
+    assert unsuspecting.believed.process == Inertial()
+    assert make_scenario("indoor-v0", imu=False).believed.process == ConstantVelocity(0.1)
+    other = replace(plain, believed_prior=Prior(position_std=7.0))
+    assert other.believed.prior.position_std == 7.0
+    assert other.prior == plain.prior
+
+
+def test_the_prior_leaf() -> None:
+    world = World(make_scenario("indoor-v0", prior_std=3.0), 400)
+    prior, truth = world.reset(0)["prior"].double(), world.truth
+    width = all_leaves(world.scenario)["prior"].width
+    assert prior.shape[-1] == width == 15
+    parts = prior.split((3, 3, 4, 3, 1, 1), -1)
+    n = prior[..., 0].numel()
+    for mean, true, std in ((parts[0], truth.position, 3.0), (parts[1], truth.velocity, 0.2)):
+        error = (mean - true).flatten(0, 1)
+        assert ((error.std(0) / std - 1).abs() < 5 / (2 * n) ** 0.5).all()
+        assert (error.mean(0).abs() < 5 * std / n**0.5).all()
+    angle = 2 * (parts[2] * truth.attitude).sum(-1).abs().clamp(max=1).arccos()
+    expected = 0.05 * 3**0.5
+    assert abs(float((angle**2).mean()) ** 0.5 / expected - 1) < 5 / n**0.5
+    assert (parts[3] == 3.0).all()
+    torch.testing.assert_close(parts[4], torch.full_like(parts[4], 0.2), rtol=1e-6, atol=0)
+    torch.testing.assert_close(parts[5], torch.full_like(parts[5], 0.05), rtol=1e-6, atol=0)
+
+
+def test_a_uniform_prior_tells_the_arena_alone() -> None:
+    prior = World(make_scenario("indoor-v0", prior="uniform"), 5).reset(0)["prior"]
+    mean, std = prior[..., :3], prior[..., 10:13]
+    torch.testing.assert_close(mean, torch.tensor([15.0, 10.0, 2.5]).expand_as(mean))
+    room = torch.tensor([30.0, 20.0, 5.0])
+    torch.testing.assert_close(std, (room / 12**0.5).expand_as(std))
+
+
+def test_anchors_stand_in_corners_and_along_walls() -> None:
+    room = torch.tensor([30.0, 20.0, 5.0])
+    places = World(make_scenario("indoor-v0", anchors=16), 1).reset(0)["anchor_map"][0, 0]
+    share = places.unflatten(-1, (16, 3)) / room
+    assert len(share.unique(dim=0)) == 16
+    assert ((share == 0) | (share == 0.5) | (share == 1)).all()
+    assert ((share == 0.5).sum(-1) <= 1).all()
+    assert isinstance(make_scenario("indoor-v0", anchors=1).sensors[-1], AnchorRanging)
+
+
+def test_spaces_follow_the_sensors() -> None:
+    scenario = make_scenario("indoor-v0", n_uavs=20, anchors=2, landmarks=4)
+    space = observation_space(scenario)
+    widths = {name: box.shape[0] for name, box in space.items() if box.shape is not None}
+    assert widths == {
+        "imu": 6,
+        "landmarks": 12,
+        "landmark_mask": 4,
+        "ranges": 16,
+        "range_mask": 16,
+        "anchor_ranges": 2,
+        "anchor_range_mask": 2,
+        "links": 16,
+        "neighbours": 16,
+        "messages": 144,
+        "message_mask": 16,
+        "prior": 15,
+        "landmark_map": 12,
+        "anchor_map": 6,
+    }
+    assert state_space(scenario).shape == (20 * 12,)
+
+
+def test_two_sensors_may_not_deliver_one_leaf() -> None:
+    scenario = make_scenario("indoor-v0")
+    with pytest.raises(ValueError, match="indoor-v0: two sensors deliver the leaf 'imu'"):
+        observation_space(replace(scenario, sensors=(Imu(), Imu())))
