@@ -23,10 +23,20 @@ from agents.models.update import information, iterated_update, posterior
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-_OMEGA = (1.0, 0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)  # weights tried by covariance intersection
+_OMEGA = (
+    1.0,
+    0.99,
+    0.97,
+    0.93,
+    0.87,
+    0.8,
+    0.7,
+    0.55,
+    0.4,
+)  # weights tried by covariance intersection
 
 
-class GaussianBelief(TensorClass["nocast"]):
+class GaussianBelief(TensorClass):
     """Mean state, error covariance (float64) and steps taken; batch (B, N)."""
 
     state: Float[Tensor, "B N S"]
@@ -164,7 +174,7 @@ class CooperativeEkf(DeadReckoning):
         neighbours: Neighbours,
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
         """Split covariance intersection (Julier & Uhlmann 2001; Li & Nashashibi 2013): own
-        covariance over ω, the neighbours' over 1 − ω, ω chosen for the smallest position variance."""
+        covariance over ω, the neighbours' over 1 − ω, ω chosen for the least position variance."""
         d = self.process.dim
         blocks = [m.linearize(self.process, x, observation, neighbours) for m in self.intersected]
         weights = weigh(self.robust, self.gate, blocks, covariance, None)

@@ -46,8 +46,8 @@ class JointEkf(Localizer[GaussianBelief]):
         super().__init__(believed)
         if believed.slots < believed.arena.n_uavs:
             raise ValueError(
-                f"ekf_joint: teams of {believed.arena.n_uavs} with {believed.slots} neighbour slots "
-                "are too large for it; raise max_neighbours to the team's size"
+                f"ekf_joint: a team of {believed.arena.n_uavs} with {believed.slots} neighbour "
+                "slots is too large for it; raise max_neighbours to the team's size"
             )
         if iterations < 1:
             raise ValueError(f"ekf_joint: iterations={iterations} is not allowed: at least 1")
@@ -89,7 +89,9 @@ class JointEkf(Localizer[GaussianBelief]):
         state, updated, weights, delta = x, p, None, p[..., 0]
         for iteration in range(self.iterations):
             neighbours = self._neighbours(state)
-            blocks = [m.linearize(self.process, state, observation, neighbours) for m in self.models]
+            blocks = [
+                m.linearize(self.process, state, observation, neighbours) for m in self.models
+            ]
             weights = weigh(self.robust, self.gate, blocks, own, weights)
             precision, vector = self._information(blocks, weights)
             if iteration:

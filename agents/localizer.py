@@ -15,7 +15,7 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, Scenario
 
 
-class Estimate(TensorClass["nocast"]):
+class Estimate(TensorClass):
     """What each UAV says of its own state at the step observed; world frame, batch (B, N).
 
     ``position`` (m), ``velocity`` (m/s), ``covariance`` of the position (m²).
@@ -36,7 +36,7 @@ Belief = TypeVar("Belief")
 
 
 class Localizer(ABC, Generic[Belief]):
-    """An estimator as a pure function of belief and observation, for all UAVs of all worlds at once.
+    """An estimator as pure functions of belief and observation, for all UAVs of all worlds.
 
     A belief is a tensorclass of batch (B, N) that holds all there is, the key of the UAV's own
     random numbers and its step count included; the localizer itself holds settings only. UAV i's

@@ -1,7 +1,7 @@
 """SIR particle filters with Liu-West regularization and adaptive tempering, one per UAV.
 
-Gordon, Salmond & Smith 1993; resampling when the effective sample size falls below half. Neighbours'
-messages enter as ranges whose variance is inflated by the sender's own uncertainty.
+Gordon, Salmond & Smith 1993; resampling when the effective sample size falls below half.
+Neighbours' messages enter as ranges whose variance is inflated by the sender's own uncertainty.
 """
 
 import math
@@ -43,7 +43,7 @@ _RESCUE = 0.1  # the share below which it is tempered later
 _STAGES = 40  # more than any likelihood has needed
 
 
-class ParticleBelief(TensorClass["nocast"]):
+class ParticleBelief(TensorClass):
     """Particles (float32) with normalized log-weights, the UAV's own random key, steps taken, and
     the last effective sample size; batch (B, N)."""
 
@@ -215,7 +215,9 @@ class ParticleFilter(Localizer[ParticleBelief]):
         ancestors = systematic(weights, noise.uniform(key, "pf.offset", 1)[..., 0])
         draws = noise.normal(key, "pf.move", m * e).unflatten(-1, (e, m)).mT
         floor = self.floor.to(draws.device)
-        return liu_west(self.process, mean, select(apart, ancestors), covariance, draws, self.shrink, floor)
+        return liu_west(
+            self.process, mean, select(apart, ancestors), covariance, draws, self.shrink, floor
+        )
 
 
 def _per_error(process: Process, std: dict[str, float]) -> list[float]:

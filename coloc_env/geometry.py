@@ -1,8 +1,8 @@
 """Rotations in 2-D and 3-D.
 
-Conventions, stated once: quaternions are scalar-first ``[w, x, y, z]`` and map body to world; in the
-plane an attitude is a heading in radians, ``[θ]``. Perturbations are on the right, in the body frame:
-``R ⊞ δ = R exp(δ)``. World frame ENU, body frame FLU.
+Conventions, stated once: quaternions are scalar-first ``[w, x, y, z]`` and map body to world; in
+the plane an attitude is a heading in radians, ``[θ]``. Perturbations are on the right, in the body
+frame: ``R ⊞ δ = R exp(δ)``. World frame ENU, body frame FLU.
 """
 
 import torch
@@ -121,7 +121,9 @@ def rotation_matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
     return torch.cat((cosine, -sine, sine, cosine), -1).unflatten(-1, (2, 2))
 
 
-def rotate_by(attitude: Float[Tensor, "*s a"], delta: Float[Tensor, "*s t"]) -> Float[Tensor, "*s a"]:
+def rotate_by(
+    attitude: Float[Tensor, "*s a"], delta: Float[Tensor, "*s t"]
+) -> Float[Tensor, "*s a"]:
     """``attitude ⊞ delta``: a right (body-frame) perturbation, t = 3 or 1."""
     if attitude.shape[-1] == 4:
         turned = quaternion_product(attitude, quaternion_exp(delta))

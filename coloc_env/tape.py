@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Tape:
-    """A tensor [T, …] read by step, on whichever device asks; after the last step it stays there."""
+    """A tensor [T, …] read by step on any device; after the last step it stays there."""
 
     values: Shaped[Tensor, "T *rest"]
     _copies: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)

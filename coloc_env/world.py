@@ -23,7 +23,7 @@ from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
 from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
 
-_AGENT_STEPS = 6144  # (row, step, UAV) items sensed at once: what stays in cache
+_AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: many, but still in cache
 _NEVER = 1 << 62
 _LONGEST = 256  # steps sensed ahead at most: what comes of a shorter episode is thrown away
 

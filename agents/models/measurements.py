@@ -38,7 +38,7 @@ class Neighbours:
 
 
 def heard(believed: Believed, observation: Observation) -> Neighbours:
-    """Neighbours as their messages tell: estimates of some steps ago, moved on at their velocity."""
+    """Neighbours as their messages tell: past estimates, moved on at their velocity."""
     d = believed.arena.dim
     content = observation["messages"].double().unflatten(-1, (believed.slots, 3 * d))
     age = believed.arena.dt * (1 + believed.message_delay)
@@ -56,8 +56,8 @@ class Block:
     ``jacobian`` is ∂h/∂δ of the UAV's own error (empty where derivatives were not asked for),
     ``variance`` the measurement's own noise (diagonal).
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
-    position and ``partner_variance`` what its uncertainty adds; they come as (…, slot, ``per_slot``)
-    flattened, and ``mutual`` says that both UAVs hold the very same number.
+    position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
+    ``per_slot``) flattened, and ``mutual`` says that both UAVs hold the very same number.
     """
 
     residual: Float[Tensor, "B N m k"]
@@ -115,7 +115,9 @@ class LandmarkVectors(Measurement):
         d = process.dim
         rotation, turn = process.rotation(x), process.attitude_error
         if rotation is None or turn is None:
-            raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
+            raise ValueError(
+                "landmark vectors are in the body frame: the motion model has no attitude"
+            )
         z = observation["landmarks"].to(x.dtype).unflatten(-1, (-1, d))
         apart = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)) - x[..., None, :d]
         expected = apart @ rotation

@@ -1,8 +1,8 @@
 """What a team believes of its motion: one interface, three models, batched over anything.
 
-A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the tangent
-space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position is
-always ``x[..., :d]``, velocity ``x[..., d:2d]`` and the position's error ``δ[..., :d]``.
+A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the
+tangent space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position
+is always ``x[..., :d]``, velocity ``x[..., d:2d]`` and the position's error ``δ[..., :d]``.
 """
 
 from abc import ABC, abstractmethod
@@ -44,7 +44,7 @@ class Process(ABC):
         dt: Float[Tensor, "*s"],
         noise: Float[Tensor, "*s W"] | None = None,
     ) -> Float[Tensor, "*s S"]:
-        """The state after ``dt`` seconds, with standard normal ``noise`` where a sample is wanted."""
+        """The state after ``dt`` seconds; a sample of it with standard normal ``noise``."""
 
     @abstractmethod
     def linearize(
@@ -252,9 +252,7 @@ class ConstantVelocityProcess(Process):
     """x = [p, v]; white acceleration, and optionally a pull of the velocity to zero
     (Ornstein-Uhlenbeck, exactly discretized)."""
 
-    def __init__(
-        self, dim: int, dt: float, settings: believed_processes.ConstantVelocity
-    ) -> None:
+    def __init__(self, dim: int, dt: float, settings: believed_processes.ConstantVelocity) -> None:
         super().__init__(dim, dt)
         self.settings = settings
         self.state_size = self.error_size = self.noise_size = 2 * dim

@@ -1,9 +1,8 @@
-"""Quaternion algebra at both sizes that localizers need, in the conventions of ``coloc_env.geometry``.
+"""Quaternion algebra at both sizes that localizers need; conventions of ``coloc_env.geometry``.
 
 The Hamilton product and the rotation matrix are linear in the outer product of two quaternions. For
 the states of Kalman filters one product with a constant matrix saves some thirty operations, whose
 cost is their number; for clouds of particles ``geometry``'s elementwise forms are faster.
-Results have the memory order of ``geometry.join``.
 """
 
 from functools import lru_cache
@@ -21,17 +20,17 @@ _STATES = 3
 
 
 @lru_cache
-def _product_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 16"]:
+def _product_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "16 4"]:
     """outer(a, b) → a ⊗ b, from the products of the basis quaternions."""
     basis = torch.eye(4, dtype=dtype, device=device)
     pairs = geometry.quaternion_product(
         basis.unsqueeze(1).expand(4, 4, 4), basis.unsqueeze(0).expand(4, 4, 4)
     )
-    return pairs.reshape(16, 4).mT.contiguous()
+    return pairs.reshape(16, 4).contiguous()
 
 
 @lru_cache
-def _matrix_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "9 16"]:
+def _matrix_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "16 9"]:
     """outer(q, q) → the rotation matrix, row by row: its columns are q ⊗ e ⊗ q*."""
     basis = torch.eye(4, dtype=dtype, device=device)
     left = basis.unsqueeze(1).expand(4, 4, 4)
@@ -42,15 +41,15 @@ def _matrix_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "9 16
             geometry.quaternion_product(left, basis[axis].expand(4, 4, 4)), right
         )
         columns.append(turned[..., 1:].reshape(16, 3))
-    return torch.stack(columns, -1).reshape(16, 9).mT.contiguous()
+    return torch.stack(columns, -1).reshape(16, 9).contiguous()
 
 
 def _bilinear(
-    matrix: Float[Tensor, "k 16"], a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]
+    matrix: Float[Tensor, "16 k"], a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]
 ) -> Float[Tensor, "*s k"]:
-    outer = a.movedim(-1, 0).unsqueeze(1) * b.movedim(-1, 0).unsqueeze(0)
-    mapped = matrix @ outer.reshape(16, -1)
-    return mapped.view(-1, *outer.shape[2:]).movedim(0, -1)
+    # One row a state: products with one column go a way of their own and round differently.
+    outer = (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
+    return (outer.reshape(-1, 16) @ matrix).view(*outer.shape[:-1], -1)
 
 
 def product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:

@@ -32,8 +32,8 @@ def landmark_log_likelihood(
     centre's rotation (R = R̄ + ΔR), which keeps float32 from cancelling.
     """
     d = process.dim
-    z = observation["landmarks"].unflatten(-1, (-1, d))
     visible = observation["landmark_mask"].unsqueeze(-1)
+    z = observation["landmarks"].unflatten(-1, (-1, d)) * visible
     points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
     points = points * visible
     at = process.rotation(centre)

@@ -6,7 +6,7 @@ from matplotlib.text import Text
 
 from coloc_env.render import style
 from coloc_env.render.history import History, rms
-from coloc_env.render.shapes import WIDTH, HEIGHT, metres
+from coloc_env.render.shapes import HEIGHT, WIDTH, metres
 from coloc_env.render.snapshot import Snapshot
 from coloc_env.scenario import Scenario
 

@@ -11,10 +11,9 @@ from coloc_env.render.header import Header
 from coloc_env.render.history import History
 from coloc_env.render.legend import Key
 from coloc_env.render.scene import Scene, Sizes
-from coloc_env.render.shapes import DPI, HEIGHT, WIDTH, metres, nice, plan, tilted
+from coloc_env.render.shapes import HEIGHT, WIDTH, nice, plan, tilted
 from coloc_env.render.snapshot import Snapshot
 from coloc_env.scenario import Scenario
-
 
 
 class Picture:

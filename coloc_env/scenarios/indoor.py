@@ -81,7 +81,12 @@ def indoor(
     if landmarks:
         true.append(
             Landmarks(
-                landmarks, landmark_std, landmark_radius, false_matches, landmark_dropout, range_only
+                landmarks,
+                landmark_std,
+                landmark_radius,
+                false_matches,
+                landmark_dropout,
+                range_only,
             )
         )
         believed.append(Landmarks(landmarks, landmark_std, landmark_radius))

@@ -1,4 +1,4 @@
-"""Scenarios by id: what exists, which overrides each takes, and clear words for what it does not."""
+"""Scenarios by id: what exists, which overrides each takes, clear words for the rest."""
 
 import inspect
 from collections.abc import Callable

@@ -157,7 +157,12 @@ def replay_euroc(
     if landmarks:
         sensors.append(
             Landmarks(
-                landmarks, landmark_std, landmark_radius, false_matches, landmark_dropout, range_only
+                landmarks,
+                landmark_std,
+                landmark_radius,
+                false_matches,
+                landmark_dropout,
+                range_only,
             )
         )
         believed.append(Landmarks(landmarks, landmark_std, landmark_radius))
@@ -214,7 +219,10 @@ def replay_miluv(
     error = RangeNoise(std=range_std)
     anchors = AnchorRanging(tuple(map(tuple, recording.anchors.tolist())), error, tags)
     height = Height(height_std)
-    sensors = [recorded_anchor_ranges(recording, grid, anchors), recorded_height(recording, grid, height)]
+    sensors = [
+        recorded_anchor_ranges(recording, grid, anchors),
+        recorded_height(recording, grid, height),
+    ]
     believed: list[Sensor] = [anchors, height]
     if "uav_ranges" in recording.streams:
         uwb = Ranging(error, tags)

@@ -143,7 +143,7 @@ def test_without_measurements_the_first_estimate_is_the_prior(
     prior = first["prior"].double()
     std = prior[..., -d - 2 : -2]
     sampled = "particles" in options_of(case.name.split(":")[0])
-    error = 5 / math.sqrt(64) if sampled else 1e-6
+    error = 5 / math.sqrt(65) if sampled else 1e-6
     torch.testing.assert_close(
         (estimate.position.double() - prior[..., :d]) / std,
         torch.zeros_like(std),

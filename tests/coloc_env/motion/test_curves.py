@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from coloc_env.geometry import rotation_matrix, wrap_angle
-from coloc_env.tape import Tape
 from coloc_env.motion import (
     Circle,
     FigureEight,
@@ -17,6 +16,7 @@ from coloc_env.motion import (
     Square,
     StopAndGo,
 )
+from coloc_env.tape import Tape
 
 ROOM = (30.0, 20.0, 5.0)
 
