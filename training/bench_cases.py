@@ -14,7 +14,7 @@ from coloc_env.world import World
 
 ENDLESS = 10**9  # steps: no episode ends while it is timed
 SIZES = (1, 32, 1024)
-_STEPS = {1: 100, 32: 100, 1024: 20}  # of a rollout, or a collector's batch
+_STEPS = {1: 100, 32: 100, 1024: 10}  # of a rollout, or a collector's batch
 TEAMS = (2, 6, 12, 24, 50, 100, 200)
 LANDMARKS = (0, 5, 20, 80)
 

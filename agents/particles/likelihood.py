@@ -98,5 +98,5 @@ def log_likelihood(
         squared = block.residual**2 / variance
         if block.partner_variance is not None:
             squared = squared + variance.log()
-        total = total - 0.5 * (squared.sum(-1) * block.mask).sum(-1)
+        total = total - 0.5 * squared.sum(-1).masked_fill(~block.mask, 0.0).sum(-1)
     return total

@@ -24,7 +24,7 @@ def copies(observation: Observation) -> Observation:
 
 def test_beliefs_and_estimates_have_the_shapes_promised(case: SimpleNamespace) -> None:
     arena = case.scenario.arena
-    batch, d = (3, arena.n_uavs), arena.dim
+    batch, d = (2, arena.n_uavs), arena.dim
     for belief in case.run.beliefs:
         assert is_tensorclass(belief)
         assert belief.batch_size == batch
@@ -83,7 +83,7 @@ def test_reset_is_pure(case: SimpleNamespace, tools: SimpleNamespace) -> None:
 
 
 def test_a_run_can_be_repeated(case: SimpleNamespace, tools: SimpleNamespace) -> None:
-    again = tools.play(tools.build(case.name, case.scenario), case.scenario, (3, 4, 5), 6)
+    again = tools.play(tools.build(case.name, case.scenario), case.scenario, (3, 4), 5)
     for one, other in zip(again.estimates, case.run.estimates, strict=True):
         tools.assert_same(one, other)
     tools.assert_same(again.beliefs[-1], case.run.beliefs[-1])
@@ -101,8 +101,8 @@ def test_steps_do_not_touch_the_global_generator(case: SimpleNamespace) -> None:
 def test_a_row_of_a_batch_is_its_own_run(case: SimpleNamespace, tools: SimpleNamespace) -> None:
     """Exactly, but for sums over the team: particles would multiply any rounding by thousands."""
     tolerance = SUMMED if case.localizer.centralized else EXACT
-    for row, seed in enumerate((3, 4, 5)):
-        alone = tools.play(case.localizer, case.scenario, [seed], 6)
+    for row, seed in enumerate((3, 4)):
+        alone = tools.play(case.localizer, case.scenario, [seed], 5)
         for one, many in zip(alone.estimates, case.run.estimates, strict=True):
             tools.assert_same(one, many[row : row + 1], tolerance)
 
@@ -143,7 +143,7 @@ def test_without_measurements_the_first_estimate_is_the_prior(
     prior = first["prior"].double()
     std = prior[..., -d - 2 : -2]
     sampled = "particles" in options_of(case.name.split(":")[0])
-    error = 5 / math.sqrt(65) if sampled else 1e-6
+    error = 5 / math.sqrt(33) if sampled else 1e-6
     torch.testing.assert_close(
         (estimate.position.double() - prior[..., :d]) / std,
         torch.zeros_like(std),
