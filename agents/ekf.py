@@ -18,7 +18,7 @@ from torch import Tensor
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
-from agents.models.robust import Robust, weigh
+from agents.models.robust import Robust, check_gate, weigh
 from agents.models.update import information, iterated_update, posterior
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -132,8 +132,7 @@ class CooperativeEkf(DeadReckoning):
         super().__init__(believed)
         if iterations < 1:
             raise ValueError(f"ekf: iterations={iterations} is not allowed: at least 1")
-        if not 0 < gate < 1:
-            raise ValueError(f"ekf: gate={gate} is not allowed: a probability in (0, 1)")
+        check_gate(gate)
         self.robust, self.gate, self.iterations = robust, gate, iterations
         models = make_measurements(believed)
         own = [m for m in models if not m.cooperative]

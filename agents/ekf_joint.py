@@ -18,7 +18,7 @@ from agents.ekf import (
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, make_measurements
 from agents.models.process import make_process
-from agents.models.robust import Robust, weigh
+from agents.models.robust import Robust, check_gate, weigh
 from agents.models.update import posterior
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -51,6 +51,7 @@ class JointEkf(Localizer[GaussianBelief]):
             )
         if iterations < 1:
             raise ValueError(f"ekf_joint: iterations={iterations} is not allowed: at least 1")
+        check_gate(gate)
         self.process = make_process(believed)
         self.robust, self.gate, self.iterations = robust, gate, iterations
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]

@@ -98,7 +98,9 @@ def make(name: str, scenario: Scenario, **chosen: Any) -> Localizer:
     known = options_of(name)
     for text in texts:
         key, value = options.parse(name, text, known)
-        chosen.setdefault(key, value)
+        if key in chosen:
+            raise ValueError(f"{name}: {key} is given twice")
+        chosen[key] = value
     options.check(name, chosen, known)
     try:
         return LOCALIZERS[name](scenario.believed, **chosen)

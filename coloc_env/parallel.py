@@ -1,5 +1,6 @@
 """The PettingZoo face: one world, numpy in and out."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -17,7 +18,6 @@ from coloc_env.sense import Sensed
 from coloc_env.world import World
 
 RENDER_MODES = ("human", "rgb_array")
-INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
 
 T = TypeVar("T")
 
@@ -35,7 +35,6 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     metadata = {  # noqa: RUF012 (PettingZoo's own convention)
         "name": "coloc",
         "render_modes": list(RENDER_MODES),
-        "render_fps": 10,
         "is_parallelizable": True,
     }
 
@@ -46,7 +45,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             )
         self.scenario = scenario
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "name": scenario.name}
+        fps = max(1, round(1 / scenario.arena.dt))
+        self.metadata = {**self.metadata, "name": scenario.name, "render_fps": fps}
         self.world = World(scenario)
         self.possible_agents = scenario.agents
         self.agents: list[str] = []
@@ -81,11 +81,11 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.agents = list(self.possible_agents)
         self.world.reset([seed])
         self._window = _Window(self.world.sensed)
-        self._tally = _Tally(len(self.agents))
+        self._tallies = {agent: _Tally() for agent in self.agents}
         self._static = [list(leaf[0].numpy().copy()) for leaf in self.world.static.values()]
         if self._renderer is not None:
             self._renderer.reset()
-        return self._observe(self.agents), self._of(self.agents, self._tally.infos())
+        return self._observe(), {a: tally.info(0.0, False) for a, tally in self._tallies.items()}
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -107,13 +107,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         estimates = self._estimates_of(actions)
         if self._renderer is not None:
             self._renderer.record(world, estimates)
-        scored = self._window.scored[world.cursor]
+        scored = self._of(self._window.scored[world.cursor])
         step = world.step(estimates)
-        self._tally.add(step.error.numpy()[0], scored)
-        observations = self._observe(acting)
-        infos = self._of(acting, self._tally.infos())
-        rewards = self._of(acting, step.reward.tolist()[0])
-        over = bool(self._window.over[world.cursor])
+        observations = self._observe()
+        errors, rewards = self._of(step.error.tolist()[0]), self._of(step.reward.tolist()[0])
+        infos = {a: self._tallies[a].add(errors[a], scored[a]) for a in acting}
+        over = self._window.over[world.cursor]
         terminated, truncated = dict.fromkeys(acting, False), dict.fromkeys(acting, over)
         if self._can_fail:
             for i in np.flatnonzero(self._window.failed[world.cursor]):
@@ -160,7 +159,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             stacked = np.array([[actions[a] for a in agents]], dtype=np.float32)
         except (TypeError, ValueError):
             raise self._wrong(actions) from None
-        if stacked.shape != (1, len(agents), self._width) or not np.isfinite(stacked).all():
+        fits = stacked.shape == (1, len(agents), self._width)
+        if not fits or np.count_nonzero(np.isfinite(stacked)) < stacked.size:
             raise self._wrong(actions)
         if len(agents) < count:
             acting, stacked = stacked, np.zeros((1, count, self._width), np.float32)
@@ -182,13 +182,13 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
                 return ValueError(f"{what} holds NaN or infinity; {needed}")
         raise AssertionError("every action fits")
 
-    def _of(self, agents: list[str], every: list[T]) -> dict[str, T]:
-        """The entries of some agents from a list of all."""
-        if len(agents) == len(every):
-            return dict(zip(agents, every, strict=True))
-        return {agent: every[self._index[agent]] for agent in agents}
+    def _of(self, every: list[T]) -> dict[str, T]:
+        """The acting agents' entries of a list of all."""
+        if len(self.agents) == len(every):
+            return dict(zip(self.agents, every, strict=True))
+        return {agent: every[self._index[agent]] for agent in self.agents}
 
-    def _observe(self, agents: list[str]) -> dict[str, dict[str, np.ndarray]]:
+    def _observe(self) -> dict[str, dict[str, np.ndarray]]:
         """Each agent's leaves: views of a window that the world never writes to again."""
         world = self.world
         if world.sensed is not self._window.sensed:
@@ -196,42 +196,43 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]
         rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *self._static, strict=True)
-        return self._of(agents, [dict(zip(self._names, row, strict=True)) for row in rows])
+        return self._of([dict(zip(self._names, row, strict=True)) for row in rows])
 
 
 class _Window:
-    """A window of the one world as arrays [K, …], converted once."""
+    """A window of the one world as arrays and lists [K, …], converted once."""
 
     def __init__(self, sensed: Sensed) -> None:
         self.sensed = sensed
-        self.over = sensed.over.numpy()[0]
+        self.over: list[bool] = sensed.over.tolist()[0]
+        self.scored: list[list[bool]] = sensed.scored.tolist()[0]
         self.failed = sensed.failed.numpy()[0]
-        self.scored = sensed.scored.numpy()[0]
         self.leaves = [leaf.numpy()[0] for leaf in sensed.leaves.values()]
 
 
 class _Tally:
-    """The errors of an episode so far, UAV by UAV: what infos tell."""
+    """One UAV's errors in an episode so far: what its infos tell."""
 
-    def __init__(self, n_uavs: int) -> None:
-        self._error, self._scored = np.zeros((2, n_uavs))
-        self._count, self._sum, self._squares, self._largest = np.zeros((4, n_uavs))
+    def __init__(self) -> None:
+        self._count, self._sum, self._squares, self._largest = 0, 0.0, 0.0, 0.0
 
-    def add(self, error: np.ndarray, scored: np.ndarray) -> None:
-        """Errors [N] in m of one step, 0 where they are not scored."""
-        self._error, self._scored = error, scored.astype(np.float64)
-        self._count += self._scored
+    def add(self, error: float, scored: bool) -> dict[str, float]:
+        """The info after a step with this error in m (0 where it is not scored)."""
+        self._count += scored
         self._sum += error
         self._squares += error * error
-        np.maximum(self._largest, error, out=self._largest)
+        self._largest = max(self._largest, error)
+        return self.info(error, scored)
 
-    def infos(self) -> list[dict[str, float]]:
-        """One info a UAV, keys ``INFO_KEYS``."""
-        count = np.maximum(self._count, 1)
-        rmse, mean = np.sqrt(self._squares / count), self._sum / count
-        columns = (self._error, self._scored, rmse, mean, self._largest)
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        return [dict(zip(INFO_KEYS, row, strict=True)) for row in rows]
+    def info(self, error: float, scored: bool) -> dict[str, float]:
+        count = self._count or 1
+        return {
+            "error": error,
+            "scored": float(scored),
+            "episode_rmse": math.sqrt(self._squares / count),
+            "episode_mean": self._sum / count,
+            "episode_max": self._largest,
+        }
 
 
 def parallel_env(

@@ -6,7 +6,7 @@ the same seed exactly, however many rows share the batch and however many steps 
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -14,22 +14,17 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Kinematics
-from coloc_env.observation import (
-    Observation,
-    action_width,
-    static_leaves,
-)
+from coloc_env.observation import Observation, action_width, static_leaves
 from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
 from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
 
-_AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: many, but still in cache
+_AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: more would not be faster
+_LONGEST = 256  # steps sensed ahead at most: a reset throws away what was not used
 _NEVER = 1 << 62
-_LONGEST = 256  # steps sensed ahead at most: what comes of a shorter episode is thrown away
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """What one step of the world brings.
 
     ``error`` is the position error in m of the estimates just scored, 0 where ``scored`` is False
@@ -46,8 +41,8 @@ class Step:
 class World:
     """B worlds of one scenario in lock-step.
 
-    ``window``: how many steps are sensed ahead (default: as many as stay in cache); it changes no
-    number. Nothing handed out is ever written to again.
+    ``window``: how many steps are sensed ahead (default: as many as pay); it changes no number.
+    Nothing handed out is ever written to again.
     """
 
     sensed: Sensed
@@ -155,7 +150,7 @@ class World:
     # ---------------------------------------------------------------- sense
 
     def _sense(self, first: Int64[Tensor, "B"], past: Past | None) -> None:
-        """Sense a window from each row's ``first`` step on, in blocks that stay in cache."""
+        """Sense a window from each row's ``first`` step on, in blocks of rows."""
         blocks = []
         for start in range(0, self.batch_size, self._rows):
             part = slice(start, start + self._rows)

@@ -14,7 +14,7 @@ from torch import Tensor
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix, wrap_angle
 from coloc_env.observation import Observation
-from coloc_env.scenario import Believed
+from coloc_env.scenario import Believed, ConstantVelocity
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
@@ -25,6 +25,8 @@ from coloc_env.sensors import (
     UavBearings,
 )
 from coloc_env.sensors.ranging import Tags
+
+_BODY_FRAME = (Landmarks, LandmarkBearings, UavBearings)
 
 
 @dataclass(frozen=True)
@@ -406,6 +408,9 @@ def make_measurements(believed: Believed) -> list[Measurement]:
     """A model for every believed sensor that measures position, attitude or other UAVs."""
     models: list[Measurement] = []
     for sensor in believed.sensors:
+        if isinstance(sensor, _BODY_FRAME) and isinstance(believed.process, ConstantVelocity):
+            name = type(sensor).__name__
+            raise ValueError(f"{name} are in the body frame: the motion model has no attitude")
         if isinstance(sensor, Landmarks):
             models.append(LandmarkVectors(sensor))
         elif isinstance(sensor, AnchorRanging):

@@ -114,12 +114,13 @@ class InertialProcess(Process):
 
     attitude_size = 4
     attitude_error = slice(6, 9)
-    noise_size = 6
 
     def __init__(self, dt: float, imu: Imu, settings: believed_processes.Inertial) -> None:
         super().__init__(3, dt)
         self.imu, self.settings = imu, settings
         self.biased = bool(settings.accel_bias or settings.gyro_bias)
+        self.walks = self.biased and bool(settings.accel_walk or settings.gyro_walk)
+        self.noise_size = 12 if self.walks else 6
         self.state_size, self.error_size = (16, 15) if self.biased else (10, 9)
         self.fixed, self.added = self._constants()
 
@@ -140,15 +141,18 @@ class InertialProcess(Process):
         x: Float[Tensor, "*s S"],
         u: Float[Tensor, "*s 6"],
         dt: Float[Tensor, "*s"],
-        noise: Float[Tensor, "*s 6"] | None = None,
+        noise: Float[Tensor, "*s W"] | None = None,
     ) -> Float[Tensor, "*s S"]:
-        if noise is not None:
-            std = u.new_tensor([self.imu.accel_std] * 3 + [self.imu.gyro_std] * 3)
-            u = u + std * noise
         p, v, q, biases = x[..., :3], x[..., 3:6], x[..., 6:10], x[..., 10:]
+        dt = dt.unsqueeze(-1)
         if self.biased:
             u = u - biases
-        dt = dt.unsqueeze(-1)
+        if noise is not None:
+            std = u.new_tensor([self.imu.accel_std] * 3 + [self.imu.gyro_std] * 3)
+            u = u + std * noise[..., :6]
+            if self.walks:
+                walk = u.new_tensor([self.settings.accel_walk] * 3 + [self.settings.gyro_walk] * 3)
+                biases = biases + walk * dt.sqrt() * noise[..., 6:]
         a = rotate(q, u[..., :3]) - u.new_tensor((0.0, 0.0, GRAVITY))
         q = rotate_by(q, u[..., 3:] * dt)
         return concat((p + (v + 0.5 * a * dt) * dt, v + a * dt, q, biases))
@@ -266,12 +270,15 @@ class ConstantVelocityProcess(Process):
         if damping is None:
             one = torch.ones_like(dt)
             return one, dt, density * dt**3 / 3, density * dt**2 / 2, density * dt
-        decay = torch.exp(-dt / damping)
-        carry = damping * (1 - decay)
-        vv = density * damping / 2 * (1 - decay**2)
-        pv = density * carry**2 / 2
-        pp = density * damping**2 * (dt - 2 * carry + damping / 2 * (1 - decay**2))
-        return decay, carry, pp, pv, vv
+        r = dt.double() / damping
+        once, twice = torch.expm1(-r), torch.expm1(-2 * r)
+        # What is left of the terms that cancel, as a series where nothing would be left of them.
+        series = 1 / 3 - r / 4 + 7 / 60 * r**2 - r**3 / 24
+        share = torch.where(r < 0.01, series, (r + 2 * once - 0.5 * twice) / r**3)
+        carry = -damping * once
+        pp, pv = density * dt**3 * share, density * carry**2 / 2
+        vv = -density * damping / 2 * twice
+        return tuple(c.to(dt) for c in (1 + once, carry, pp, pv, vv))
 
     def propagate(
         self,

@@ -16,6 +16,12 @@ Weights = Sequence[Float[Tensor, "B N m"]]
 _CORE = 0.8214  # share of a Gaussian inside Huber's quadratic core for 95 % efficiency (1.345 σ)
 
 
+def check_gate(gate: float) -> None:
+    """Raise ValueError unless it is the probability of a quantile."""
+    if not 0 < gate < 1:
+        raise ValueError(f"gate={gate} is not allowed: a probability in (0, 1)")
+
+
 @lru_cache
 def chi_square(probability: float, dof: int) -> float:
     """Quantile of the χ² distribution."""

@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 import torch
+from scipy.stats import chi2
 from torch import Tensor
 
 from agents import LOCALIZERS, Estimate, Localizer, make, options_of
+from agents.models.process import Process
+from coloc_env import scenario as settings
 from coloc_env.motion import Aggressive, Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.scenario import Inertial, Prior, Process, Scenario, Wheeled
+from coloc_env.scenario import Inertial, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     AnchorRanging,
@@ -28,12 +31,12 @@ from coloc_env.sensors import (
 )
 from coloc_env.world import World
 
-SEEDS, STEPS, PARTICLES = (3, 4), 5, 33
+SEEDS, STEPS, PARTICLES = (3, 4), 4, 33
 TAGS = (((0.2, 0.1, -0.1), (-0.3, 0.0, 0.1)),) * 3
 CORNERS = ((0.0, 0.0, 0.0), (10.0, 8.0, 4.0), (0.0, 8.0, 1.0), (10.0, 0.0, 3.0))
 
 
-def custom(dim: int, n: int, process: Process, sensors: tuple[Sensor, ...]) -> Scenario:
+def custom(dim: int, n: int, process: settings.Process, sensors: tuple[Sensor, ...]) -> Scenario:
     """A scenario that no family has, in a box of 10 × 8 × 4 m."""
     return Scenario(
         name="custom",
@@ -146,6 +149,47 @@ def replay(localizer: Localizer, observations: Sequence[Observation]) -> Run:
     return run
 
 
+def score(name: str, scenario: Scenario, runs: int, steps: int) -> SimpleNamespace:
+    """Errors [R, K, N, d] in m and NEES [R, K, N] of the position, in worlds 0, 1, …"""
+    localizer, world = make(name, scenario), World(scenario, runs)
+    observation, errors, nees = world.reset(0), [], []
+    belief = localizer.reset(observation)
+    for _ in range(steps):
+        belief, estimate = localizer.step(belief, observation)
+        error = estimate.position.double() - world.truth.position
+        solved = torch.linalg.solve(estimate.covariance.double(), error)
+        errors.append(error)
+        nees.append((error * solved).sum(-1))
+        world.advance(estimate.action())
+        observation = world.observation()
+    error = torch.stack(errors, 1)
+    squared = error.square().sum(-1)
+    return SimpleNamespace(
+        rmse=float(squared.mean().sqrt()),
+        rmse_per_run=squared.mean((1, 2)).sqrt(),
+        nees=torch.stack(nees, 1),
+    )
+
+
+def consistent(nees: Tensor, dim: int) -> float:
+    """Share of the steps at which the mean NEES [R, K, N] lies in its 95 % interval."""
+    count = nees.shape[0] * nees.shape[2]
+    low, high = chi2.ppf((0.025, 0.975), dim * count) / count
+    mean = nees.mean((0, 2))
+    return float(((mean > low) & (mean < high)).double().mean())
+
+
+def cloud(process: Process, spread: float, origin: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Particles [2, 3, 200, S] about centres [2, 3, S] ``origin`` m from the world's, float32."""
+    g = torch.Generator().manual_seed(0)
+    centre = torch.randn(2, 3, process.state_size, generator=g)
+    centre[..., : process.dim] += origin
+    if process.attitude_size == 4:
+        centre[..., 6:10] = torch.nn.functional.normalize(centre[..., 6:10], dim=-1)
+    delta = spread * torch.randn(2, 3, 200, process.error_size, generator=g)
+    return process.boxplus(centre.unsqueeze(2).expand(-1, -1, 200, -1), delta), centre
+
+
 def change(observation: Observation, **leaves: Tensor) -> Observation:
     """The observation with some leaves replaced."""
     return Observation({**observation.leaves, **leaves})
@@ -183,6 +227,10 @@ def assert_same(found: Any, expected: Any, tolerance: float = 0.0) -> None:
         )
 
 
+def _sees_all(name: str) -> bool:
+    return getattr(LOCALIZERS[name.split(":")[0]], "centralized", False)
+
+
 @cache
 def recorded(name: str, family: str) -> Case:
     scenario = FAMILIES[family]()
@@ -209,10 +257,12 @@ def tools() -> SimpleNamespace:
         build=build,
         play=play,
         replay=replay,
+        cloud=cloud,
         change=change,
         behind=behind,
         masked_pairs=masked_pairs,
         assert_same=assert_same,
         families=FAMILIES,
-        custom=custom,
+        score=score,
+        consistent=consistent,
     )

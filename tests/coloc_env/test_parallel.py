@@ -16,10 +16,11 @@ from torchrl.envs import PettingZooWrapper
 import coloc_env
 from coloc_env.batched import CoLocEnv
 from coloc_env.observation import stack
-from coloc_env.parallel import INFO_KEYS, CoLocParallelEnv, env, parallel_env
+from coloc_env.parallel import CoLocParallelEnv, env, parallel_env
 from coloc_env.scenarios import FAMILIES, make_scenario
 from coloc_env.world import World
 
+INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "failures": {"failure_rate": 0.8},

@@ -122,7 +122,39 @@ def test_any_batch_size(variant: str, size: int) -> None:
             same(together, row, alone)
 
 
+def compare_episodes(
+    scenario: Scenario,
+    seeds: list[int],
+    steps: int,
+    window: int | None,
+    resets: dict[int, tuple[list[bool], list[int]]],
+) -> None:
+    """Every episode of every row against a world of its own."""
+    batch = list(play(scenario, seeds, steps, window, resets))
+    for row, seed in enumerate(seeds):
+        begun = {0: seed} | {k: fresh[row] for k, (rows, fresh) in resets.items() if rows[row]}
+        for begin, end in pairwise([*sorted(begun), steps]):
+            alone = play(scenario, [begun[begin]], end - begin)
+            for j, single in enumerate(alone):
+                # What was scored before an episode's first step belongs to the episode before.
+                late = ("reward", "error", "scored", "terminated", "truncated") if not j else ()
+                same({k: v for k, v in batch[begin + j].items() if k not in late}, row, single)
+
+
 MOMENTS = ["plain", "motion random_velocity", "message delay", "delay", "failures", "many"]
+
+
+@pytest.mark.parametrize("window", [None, 1, 7])
+@pytest.mark.parametrize("variant", [*MOMENTS, "biases", "anchors"])
+def test_rows_reset_alone(variant: str, window: int | None) -> None:
+    resets = {
+        3: ([False, True, False], [0, 40, 0]),
+        4: ([True, False, True], [41, 0, 42]),
+        5: ([True, True, True], [43, 44, 45]),
+        12: ([False, False, True], [0, 0, 46]),
+    }
+    scenario = make_scenario("indoor-v0", **VARIANTS[variant])
+    compare_episodes(scenario, [0, 1, 2], 20, window, resets)
 
 
 @given(
@@ -135,9 +167,7 @@ MOMENTS = ["plain", "motion random_velocity", "message delay", "delay", "failure
 def test_rows_reset_alone_at_any_moment(
     variant: str, window: int | None, size: int, data: st.DataObject
 ) -> None:
-    scenario = make_scenario("indoor-v0", **VARIANTS[variant])
-    steps = 20
-    moments = data.draw(st.lists(st.integers(0, steps - 1), max_size=4, unique=True))
+    moments = data.draw(st.lists(st.integers(0, 17), max_size=4, unique=True))
     resets = {
         k: (
             data.draw(st.lists(st.booleans(), min_size=size, max_size=size)),
@@ -145,18 +175,8 @@ def test_rows_reset_alone_at_any_moment(
         )
         for k in moments
     }
-    seeds = list(range(size))
-    batch = list(play(scenario, seeds, steps, window, resets))
-    for row in range(size):
-        starts = [0, *sorted(k for k in resets if resets[k][0][row] and k > 0), steps]
-        first = resets[0][1][row] if 0 in resets and resets[0][0][row] else seeds[row]
-        for begin, end in pairwise(starts):
-            seed = resets[begin][1][row] if begin > 0 else first
-            for j, alone in enumerate(play(scenario, [seed], end - begin)):
-                # What was scored before an episode's first step belongs to the episode before.
-                late = ("reward", "error", "scored", "terminated", "truncated") if not j else ()
-                together = {k: v for k, v in batch[begin + j].items() if k not in late}
-                same(together, row, alone)
+    scenario = make_scenario("indoor-v0", **VARIANTS[variant])
+    compare_episodes(scenario, list(range(size)), 18, window, resets)
 
 
 def test_a_reset_of_no_row_changes_nothing() -> None:
@@ -265,6 +285,15 @@ def test_a_message_arrives_one_step_and_its_delay_later(delay: int) -> None:
         action = (100.0 * k + torch.arange(6.0))[None, :, None].expand(2, 6, 9)
         world.step(action)
         observation = world.observation()
+
+
+def test_a_message_is_what_was_said_not_what_became_of_it() -> None:
+    world = World(make_scenario("indoor-v0"), 1)
+    world.reset(0)
+    action = torch.ones(1, 6, 9)
+    world.step(action)
+    action.fill_(7.0)
+    assert float(world.observation()["messages"].max()) == 1.0
 
 
 def test_a_diverged_estimate_reaches_only_those_who_hear_it() -> None:

@@ -1,0 +1,132 @@
+"""Making localizers by name: what is there, and one clear line for what is not."""
+
+from collections.abc import Callable
+
+import pytest
+
+from agents import LOCALIZERS, Localizer, make, options_of, register
+from agents.ekf import CooperativeEkf
+from coloc_env.scenario import Believed, Scenario
+from coloc_env.scenarios import make_scenario
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return make_scenario("indoor-v0", n_uavs=2)
+
+
+@pytest.mark.parametrize("name", LOCALIZERS)
+def test_every_name_makes_a_localizer_from_beliefs_alone(name: str, scenario: Scenario) -> None:
+    localizer = make(name, scenario)
+    assert isinstance(localizer, Localizer)
+    assert localizer.believed is scenario.believed
+    assert all(option.default is not option.empty for option in options_of(name).values())
+
+
+def test_options_come_by_keyword_or_in_the_name(scenario: Scenario) -> None:
+    by_name = make("ekf:robust=huber:iterations=3:cooperate=false", scenario)
+    by_key = make("ekf", scenario, robust="huber", iterations=3, cooperate=False)
+    for localizer in (by_name, by_key):
+        assert isinstance(localizer, CooperativeEkf)
+        assert (localizer.robust, localizer.iterations) == ("huber", 3)
+        assert not any(model.cooperative for model in localizer.first)
+    assert make("pf800:particles=1000", scenario).particles == 1000  # type: ignore[attr-defined]
+
+
+REFUSALS = {
+    "ekff": ["unknown agent 'ekff'", "did you mean 'ekf'", *LOCALIZERS],
+    "": ["unknown agent ''", *LOCALIZERS],
+    " ekf": ["unknown agent ' ekf'"],
+    "EKF": ["unknown agent 'EKF'"],
+    "ekf:robst=huber": ["ekf", "unknown option 'robst'", "did you mean 'robust'", "iterations"],
+    "ekf:robust=hubert": ["ekf", "robust='hubert'", "one of none, huber, gate"],
+    "ekf:iterations=two": ["ekf", "iterations='two'", "a whole number"],
+    "ekf:iterations=2.5": ["ekf", "iterations='2.5'", "a whole number"],
+    "ekf:iterations=0": ["ekf", "iterations=0", "at least 1"],
+    "ekf:iterations=-3": ["ekf", "iterations=-3", "at least 1"],
+    "ekf:gate=1": ["ekf", "gate=1.0", "(0, 1)"],
+    "ekf:gate=nan": ["ekf", "gate='nan'", "a number"],
+    "ekf:cooperate=perhaps": ["ekf", "cooperate='perhaps'", "true or false"],
+    "ekf:fusion=CI": ["ekf", "fusion='CI'", "one of naive, ci"],
+    "ekf:robust": ["ekf", "option 'robust'", "key=value"],
+    "ekf:": ["ekf", "option ''", "key=value"],
+    "ekf::robust=huber": ["ekf", "option ''", "key=value"],
+    "ekf:=huber": ["ekf", "unknown option ''", "robust"],
+    "ekf:robust=": ["ekf", "robust=''", "one of none, huber, gate"],
+    "ekf:robust=huber=gate": ["ekf", "robust='huber=gate'"],
+    "ekf:robust=huber:robust=gate": ["ekf", "robust", "twice"],
+    "dead_reckoning:robust=huber": ["dead_reckoning", "unknown option 'robust'", "none"],
+    "ekf_joint:gate=0": ["ekf_joint", "gate=0.0", "(0, 1)"],
+    "ekf_joint:iterations=0": ["ekf_joint", "iterations=0", "at least 1"],
+    "pf800:particles=9": ["pf800", "particles=9", "at least 10"],
+    "pf500:perturb=liuwest": ["pf500", "perturb='liuwest'", "one of liu_west, fixed"],
+    "pf500:seed=1e3": ["pf500", "seed='1e3'", "a whole number"],
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_does_not_fit_is_refused_in_one_line(name: str, scenario: Scenario) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        make(name, scenario)
+    text = str(caught.value)
+    assert "\n" not in text
+    for part in REFUSALS[name]:
+        assert part in text, f"{part!r} is not in {text!r}"
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        ({"robust": "hubert"}, ["ekf", "robust='hubert'", "huber"]),
+        ({"robust": None}, ["ekf", "robust=None", "huber"]),
+        ({"iterations": "2"}, ["ekf", "iterations='2'", "a whole number"]),
+        ({"iterations": True}, ["ekf", "iterations=True", "a whole number"]),
+        ({"cooperate": 1}, ["ekf", "cooperate=1", "true or false"]),
+        ({"gate": float("nan")}, ["ekf", "gate=nan", "a number"]),
+        ({"believed": None}, ["ekf", "unknown option 'believed'"]),
+    ],
+)
+def test_keywords_are_checked_like_the_name(
+    options: dict, parts: list[str], scenario: Scenario
+) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        make("ekf", scenario, **options)
+    assert all(part in str(caught.value) for part in parts), caught.value
+
+
+def test_an_option_is_given_once(scenario: Scenario) -> None:
+    with pytest.raises(ValueError, match=r"^ekf: robust is given twice"):
+        make("ekf:robust=huber", scenario, robust="gate")
+
+
+SHORTCOMINGS: dict[str, tuple[str, dict, str]] = {
+    "too many UAVs": ("ekf_joint", {"n_uavs": 20}, "max_neighbours"),
+    "no attitude": ("ekf", {"imu": False}, "attitude"),
+    "no attitude, joint": ("ekf_joint", {"imu": False}, "attitude"),
+    "no attitude, particles": ("pf500", {"imu": False}, "attitude"),
+}
+
+
+@pytest.mark.parametrize("case", SHORTCOMINGS)
+def test_a_scenario_that_does_not_suit_is_refused_when_made(case: str) -> None:
+    name, overrides, word = SHORTCOMINGS[case]
+    scenario = make_scenario("indoor-v0", **overrides)
+    with pytest.raises(ValueError, match=rf"^{name}: .*{word}"):
+        make(name, scenario)
+
+
+def test_register_adds_a_name(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> None:
+    monkeypatch.setattr("agents.localizer.LOCALIZERS", dict(LOCALIZERS))
+    from agents import localizer
+
+    @register("half")
+    def half(believed: Believed, *, share: float = 0.5) -> Localizer:
+        if share > 1:
+            raise ValueError("more than all")
+        return CooperativeEkf(believed)
+
+    made: Callable[..., Localizer] = localizer.make
+    assert isinstance(made("half:share=0.25", scenario), CooperativeEkf)
+    with pytest.raises(ValueError, match=r"^half: more than all$"):
+        made("half:share=2", scenario)
+    assert "half" not in LOCALIZERS
