@@ -63,7 +63,7 @@ class Window:
         if not windowed and figure.canvas.required_interactive_framework is None:
             plt.close(figure)
             raise RuntimeError(
-                f"render_mode='human' needs a matplotlib backend with windows, not {backend}; {hint}"
+                f"render_mode='human' needs a windowed matplotlib backend, not {backend}; {hint}"
             )
         self._figure = figure
         self._picture = Picture(figure, scenario)

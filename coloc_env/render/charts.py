@@ -114,7 +114,9 @@ class Target:
         offset = offset / radius
         distance = np.linalg.norm(offset, axis=-1, keepdims=True)
         self._dots.set_offsets(offset / np.maximum(distance, 1.0))
-        self._ellipses.set_verts(ellipses(self._view, apart / radius, snapshot.std / radius, 2.0))
+        self._ellipses.set_verts(
+            list(ellipses(self._view, apart / radius, snapshot.std / radius, 2.0))
+        )
         for label, share in zip(self._labels, (0.5, 1.0), strict=True):
             label.set_text(metres(share * radius) if np.isfinite(distance).any() else "")
 

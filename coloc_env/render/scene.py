@@ -111,10 +111,12 @@ class Scene:
         return nice(float((self._high - self._low)[:2].max()) / 12)
 
     def _polygons(self, faces: list[np.ndarray], **look: Any) -> None:
-        self._axes.add_collection(PolyCollection([self._flat(f) for f in faces], **look), autolim=False)
+        self._axes.add_collection(
+            PolyCollection([self._flat(f) for f in faces], **look), autolim=False
+        )
 
     def _lines(self, lines: np.ndarray, **look: Any) -> LineCollection:
-        made = LineCollection(self._flat(lines), **look)
+        made = LineCollection(list(self._flat(lines)), **look)
         self._axes.add_collection(made, autolim=False)
         return made
 
@@ -123,7 +125,9 @@ class Scene:
     def _add_marks(self, n_uavs: int) -> None:
         """Landmarks, anchors, links and rays."""
         size = 26.0 if n_uavs <= 60 else 12.0
-        self._landmarks = self._dots("D", size * 0.8, 2.0, facecolor=style.LANDMARK, edgecolor="none")
+        self._landmarks = self._dots(
+            "D", size * 0.8, 2.0, facecolor=style.LANDMARK, edgecolor="none"
+        )
         self._seen = self._dots("D", size * 0.8, 2.1, facecolor=style.INK, edgecolor="none")
         self._anchors = self._dots("^", size * 2, 2.2, facecolor="white", edgecolor=style.INK)
         none = np.empty((0, 2, 3))
@@ -137,7 +141,9 @@ class Scene:
         wide = style.tint(colours[:, None], 0.34 * strength).reshape(-1, 3)
         thin = style.tint(colours[:, None], strength).reshape(-1, 3)
         butt: dict[str, Any] = {"capstyle": "round"}
-        self._truth = self._lines(none, colors=wide, linewidths=_pt(sizes.trail), zorder=2.5, **butt)
+        self._truth = self._lines(
+            none, colors=wide, linewidths=_pt(sizes.trail), zorder=2.5, **butt
+        )
         self._guess = self._lines(
             none, colors=thin, linewidths=_pt(max(0.22 * sizes.trail, 0.8)), zorder=2.6, **butt
         )
@@ -188,19 +194,19 @@ class Scene:
         self._anchors.set_offsets(view(snapshot.anchors))
         self._seen.set_offsets(view(snapshot.seen))
         self._show_links(snapshot, flying)
-        self._truth.set_segments(_pieces(view(history.truth)))
-        self._guess.set_segments(_pieces(view(history.estimate)))
+        self._truth.set_segments(list(_pieces(view(history.truth))))
+        self._guess.set_segments(list(_pieces(view(history.estimate))))
         if self._deep:
             foot = flying.copy()
             foot[:, 2] = self._low[2]
-            self._stems.set_segments(np.stack((at, view(foot)), 1))
+            self._stems.set_segments(list(np.stack((at, view(foot)), 1)))
         known = np.isfinite(snapshot.estimate[:, 0]) & alive
         estimate = np.where(known[:, None], snapshot.estimate, np.nan)
-        self._ellipses.set_verts(ellipses(view, estimate, snapshot.std, 2 * exaggeration))
-        self._errors.set_segments(np.stack((at, view(estimate)), 1))
+        self._ellipses.set_verts(list(ellipses(view, estimate, snapshot.std, 2 * exaggeration)))
+        self._errors.set_segments(list(np.stack((at, view(estimate)), 1)))
         self._estimates.set_offsets(view(estimate))
         size = self._sizes.marker / self.scale
-        self._markers.set_verts(placed(self._drop, at, view.angle(snapshot.ahead), size))
+        self._markers.set_verts(list(placed(self._drop, at, view.angle(snapshot.ahead), size)))
         self._crosses.set_offsets(np.where(alive[:, None], np.nan, view(history.last_seen)))
         for number, place, shown in zip(self._numbers, at, here, strict=False):
             number.set_visible(bool(shown))
@@ -208,10 +214,10 @@ class Scene:
 
     def _show_links(self, snapshot: Snapshot, flying: np.ndarray) -> None:
         ends = self._view(flying)
-        self._links.set_segments(ends[snapshot.links])
+        self._links.set_segments(list(ends[snapshot.links]))
         seen = self._view(snapshot.seen)
         start = np.broadcast_to(ends[snapshot.watching], seen.shape)
-        self._rays.set_segments(np.stack((start, seen), 1))
+        self._rays.set_segments(list(np.stack((start, seen), 1)))
         self._rays.set_color(self._colours[snapshot.watching])
 
     def pixels(self, std: np.ndarray) -> np.ndarray:

@@ -11,8 +11,12 @@ WIDTH, HEIGHT, DPI = 1200, 750, 100  # of the picture, px
 _AZIMUTH, _ELEVATION = math.radians(-62.0), math.radians(33.0)
 _LEAST_HEIGHT = 0.11  # of the arena's longer side: flatter arenas are drawn taller
 
-BOX_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1])
-BOX_FACES = np.array([(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)])
+BOX_EDGES = np.array(
+    [(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1]
+)
+BOX_FACES = np.array(
+    [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
+)
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ def drop(tip: float) -> np.ndarray:
 
 
 def placed(shape: np.ndarray, at: np.ndarray, angle: np.ndarray, size: float) -> np.ndarray:
-    """A shape [P, 2] turned by ``angle`` [N] (rad), scaled, and moved to ``at`` [N, 2]: [N, P, 2]."""
+    """A shape [P, 2] turned by ``angle`` [N] (rad), scaled, moved to ``at`` [N, 2]: [N, P, 2]."""
     cosine, sine = np.cos(angle), np.sin(angle)
     turn = np.stack((cosine, -sine, sine, cosine), -1).reshape(-1, 2, 2)
     return at[:, None] + size * np.einsum("nij,pj->npi", turn, shape)
@@ -88,7 +92,9 @@ def ellipses(view: View, centre: np.ndarray, std: np.ndarray, scale: float) -> n
     slant = spread[:, 0, 1] / np.maximum(first, 1e-12)
     second = np.sqrt(np.maximum(spread[:, 1, 1] - slant**2, 0.0))
     cosine, sine = disc().T
-    outline = np.stack((first[:, None] * cosine, slant[:, None] * cosine + second[:, None] * sine), -1)
+    outline = np.stack(
+        (first[:, None] * cosine, slant[:, None] * cosine + second[:, None] * sine), -1
+    )
     return view(centre)[:, None] + outline
 
 

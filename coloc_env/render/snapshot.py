@@ -18,8 +18,8 @@ class Snapshot:
 
     ``position`` [N, d] (m) is NaN for failed UAVs and where a recording has no truth; ``ahead``
     [N, d] is the body's forward axis in the world frame; ``estimate`` [N, d] (m) and ``std`` [N, d]
-    (m) are NaN before an estimate was made. ``links`` [M, 2] are pairs of UAVs of which at least one
-    hears the other; ``landmarks`` [L, d] and ``anchors`` [A, d] lie on the team's map, and
+    (m) are NaN before an estimate was made. ``links`` [M, 2] are pairs of UAVs one of
+    which hears the other; ``landmarks`` [L, d] and ``anchors`` [A, d] lie on the team's map, and
     ``watching`` is the UAV that sees the points ``seen`` [K, d] among them (-1: all have failed).
     """
 
@@ -100,9 +100,7 @@ def _links(leaves: dict[str, np.ndarray], position: np.ndarray) -> np.ndarray:
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-def _seen(
-    leaves: dict[str, np.ndarray], maps: dict[str, np.ndarray], watching: int
-) -> np.ndarray:
+def _seen(leaves: dict[str, np.ndarray], maps: dict[str, np.ndarray], watching: int) -> np.ndarray:
     """Map points [K, d] of which the watching UAV has a measurement now (mask leaves [… · L])."""
     seen = [np.empty((0, maps["landmark"].shape[1]))]
     for kind, points in maps.items():

@@ -11,7 +11,12 @@ BACK = "#fafbfc"
 LINK = "#8d9ab0"
 LANDMARK = "#98a2b3"
 WALL = "#7a869c"
-FONT = {"font.family": "DejaVu Sans", "font.size": 10.0, "text.color": INK, "mathtext.default": "rm"}
+FONT = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10.0,
+    "text.color": INK,
+    "mathtext.default": "rm",
+}
 
 # Okabe and Ito's colours without yellow and black, then two of Tol's: told apart by all eyes.
 _UAVS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#7F7F1F")
