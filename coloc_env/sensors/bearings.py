@@ -108,7 +108,6 @@ class UavBearings(Sensor):
         std = (self.range_std, self.bearing_std)
         seen = range_bearing(apart, std, white.unflatten(-1, (n, count, 2)))
         return {
-            # Filled, not multiplied: the bearing to oneself is NaN.
             "uav_bearings": seen.masked_fill_(~mask.unsqueeze(-1), 0.0).flatten(-2),
             "uav_bearing_mask": mask.to(torch.float32),
         }

@@ -199,7 +199,7 @@ def test_increments_of_a_uav_are_its_own() -> None:
 
 
 def test_particles_that_cannot_be_have_no_share() -> None:
-    gain = -(normal(1, 2, 300, seed=1) ** 2)
+    gain = -0.1 * normal(1, 2, 300, seed=1) ** 2
     gain[..., ::3] = -math.inf
     level, left = torch.full_like(gain, -math.log(300)), torch.ones(1, 2)
     share = increment(level, gain, left, 0.5)

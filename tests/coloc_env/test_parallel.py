@@ -3,6 +3,7 @@
 import pickle
 import re
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -161,6 +162,16 @@ def test_a_failed_uav_terminates_once_and_leaves() -> None:
                 assert listener["message_mask"][slot] == 0
                 assert (listener["messages"][9 * slot : 9 * slot + 9] == 0).all()
     assert ended == dict.fromkeys(environment.possible_agents, 1)
+
+
+def test_a_uav_that_fails_at_the_horizon_terminates() -> None:
+    scenario = replace(make_scenario("indoor-v0", n_uavs=3, horizon=2), failures=((1, 2),))
+    environment = parallel_env(scenario)
+    environment.reset(seed=0)
+    environment.step(idle(environment))
+    _, _, terminations, truncations, _ = environment.step(idle(environment))
+    assert terminations == {"uav_0": False, "uav_1": True, "uav_2": False}
+    assert truncations == {"uav_0": True, "uav_1": False, "uav_2": True}
 
 
 def test_infos_are_flat_numeric_and_always_have_the_same_keys() -> None:

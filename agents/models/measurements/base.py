@@ -1,0 +1,86 @@
+"""What every measurement model gives: a block of residuals and Jacobians.
+
+A ``Block`` holds m measurements of k numbers each, per UAV, masked; filters of every kind (one per
+UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from agents.models.process import Process
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Where the UAVs in a UAV's slots are now, as far as it knows: position (m) and variance (m²)
+    per axis, and which slots it knows anything of."""
+
+    position: Float[Tensor, "B N S d"]
+    variance: Float[Tensor, "B N S d"]
+    known: Bool[Tensor, "B N S"]
+
+
+def heard(believed: Believed, observation: Observation) -> Neighbours:
+    """Neighbours as their messages tell: past estimates, moved on at their velocity."""
+    d = believed.arena.dim
+    content = observation["messages"].double().unflatten(-1, (believed.slots, 3 * d))
+    age = believed.arena.dt * (1 + believed.message_delay)
+    return Neighbours(
+        position=content[..., :d] + age * content[..., d : 2 * d],
+        variance=(2 * content[..., 2 * d :]).exp(),
+        known=observation["message_mask"] > 0,
+    )
+
+
+@dataclass(frozen=True)
+class Block:
+    """m measurements of k numbers each, linearized at some state: residual z − h(x).
+
+    ``jacobian`` is ∂h/∂δ of the UAV's own error (empty where derivatives were not asked for),
+    ``variance`` the measurement's own noise (diagonal).
+    Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
+    position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
+    ``per_slot``) flattened, and ``mutual`` says that both UAVs hold the very same number.
+    """
+
+    residual: Float[Tensor, "B N m k"]
+    jacobian: Float[Tensor, "B N m k E"]
+    variance: Float[Tensor, "B N m k"]
+    mask: Bool[Tensor, "B N m"]
+    partner: Float[Tensor, "B N m k d"] | None = None
+    partner_variance: Float[Tensor, "B N m k"] | None = None
+    per_slot: int = 1
+    mutual: bool = False
+
+    @property
+    def total_variance(self) -> Float[Tensor, "B N m k"]:
+        """Noise and, as if independent, the partner's uncertainty."""
+        if self.partner_variance is None:
+            return self.variance
+        return self.variance + self.partner_variance
+
+
+class Measurement(ABC):
+    """A sensor's model. ``cooperative`` ones involve other UAVs."""
+
+    cooperative = False
+
+    @abstractmethod
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        """Residuals and, unless ``derivatives`` are not wanted, Jacobians at ``x``.
+
+        Leading dimensions are free: for particles x is [B, N, M, S] and the leaves of the
+        observation and of ``neighbours`` have a dimension 1 in place of M.
+        """

@@ -1,0 +1,91 @@
+"""Range and bearing in the plane, to landmarks and to other UAVs."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from agents.models.measurements.base import Block, Measurement, Neighbours
+from agents.models.process import Process
+from coloc_env.geometry import wrap_angle
+from coloc_env.observation import Observation
+from coloc_env.sensors import LandmarkBearings, UavBearings
+
+
+def _range_bearing(
+    process: Process,
+    x: Float[Tensor, "B N S"],
+    z: Float[Tensor, "B N m 2"],
+    points: Float[Tensor, "B N m 2"],
+) -> tuple[Float[Tensor, "B N m 2"], Float[Tensor, "B N m 2 E"], Float[Tensor, "B N m 2 2"]]:
+    """Residual, own Jacobian, and ∂h/∂point of ranges and bearings to points in the plane."""
+    if process.attitude_error is None:
+        raise ValueError("bearings are in the body frame: the motion model has no attitude")
+    apart = points - x[..., None, :2]
+    squared = (apart**2).sum(-1).clamp_min(1e-12)
+    distance = squared.sqrt()
+    bearing = torch.atan2(apart[..., 1], apart[..., 0]) - process.attitude(x)
+    residual = torch.stack((z[..., 0] - distance, wrap_angle(z[..., 1] - bearing)), -1)
+    along = apart / distance.unsqueeze(-1)
+    across = torch.stack((-apart[..., 1], apart[..., 0]), -1) / squared.unsqueeze(-1)
+    by_point = torch.stack((along, across), -2)
+    jacobian = x.new_zeros(*residual.shape, process.error_size)
+    jacobian[..., :2] = -by_point
+    jacobian[..., 1, process.attitude_error] = -1.0
+    return residual, jacobian, by_point
+
+
+class LandmarkRangeBearings(Measurement):
+    """Range and bearing to landmarks at known positions."""
+
+    def __init__(self, sensor: LandmarkBearings) -> None:
+        self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        z = observation["landmark_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = torch.cat([points] * self.depth, -2)
+        residual, jacobian, _ = _range_bearing(process, x, z, points)
+        return Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=(x.new_tensor(self.std) ** 2).expand_as(residual),
+            mask=observation["landmark_bearing_mask"] > 0,
+        )
+
+
+class UavRangeBearings(Measurement):
+    """Range and bearing to neighbours, whose position is known as well as ``neighbours`` says."""
+
+    cooperative = True
+
+    def __init__(self, sensor: UavBearings) -> None:
+        self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        z = observation["uav_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        points = torch.cat([neighbours.position] * self.depth, -2)
+        residual, jacobian, by_point = _range_bearing(process, x, z, points)
+        theirs = torch.cat([neighbours.variance] * self.depth, -2)
+        known = torch.cat([neighbours.known] * self.depth, -1)
+        return Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=(x.new_tensor(self.std) ** 2).expand_as(residual),
+            mask=(observation["uav_bearing_mask"] > 0) & known,
+            partner=by_point,
+            partner_variance=(by_point**2 * theirs.unsqueeze(-2)).sum(-1),
+        )

@@ -1,0 +1,144 @@
+"""Distances from a UAV's tags to anchors and to other UAVs."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from agents.models.measurements.base import Block, Measurement, Neighbours
+from agents.models.process import Process
+from coloc_env.geometry import cross_matrix
+from coloc_env.observation import Observation
+from coloc_env.sensors import AnchorRanging, Ranging
+from coloc_env.sensors.ranging import Tags
+
+
+class _Ranges(Measurement):
+    """Distances from the UAV's own tags to points; shared by anchors and neighbours."""
+
+    def __init__(self, std: float, tags: Tags) -> None:
+        self.variance = std**2
+        self.tags = tags
+
+    def _arms(self, x: Float[Tensor, "B N S"]) -> Float[Tensor, "B N T d"]:
+        """Lever arms [N, T, d], with a dimension 1 for particles where x has them."""
+        arms = x.new_tensor(self.tags)
+        return arms.unsqueeze(1) if x.dim() == 4 else arms
+
+    def _own_tags(
+        self, process: Process, x: Float[Tensor, "B N S"]
+    ) -> tuple[Float[Tensor, "B N T d"], Float[Tensor, "B N T d t"] | None, float]:
+        """Tag positions, their derivative by the attitude error, and the variance that unknown
+        lever arms leave."""
+        d = process.dim
+        position = x[..., None, :d]
+        if not self.tags:
+            return position, None, 0.0
+        arms = self._arms(x)
+        rotation = process.rotation(x)
+        if rotation is None:
+            spread = float((arms**2).sum(-1).mean()) / d
+            return position.expand(*x.shape[:-1], arms.shape[-2], d), None, spread
+        turned = (rotation.unsqueeze(-3) @ arms.unsqueeze(-1))[..., 0]
+        if d == 3:
+            derivative = -rotation.unsqueeze(-3) @ cross_matrix(arms)
+        else:
+            derivative = torch.stack((-turned[..., 1:], turned[..., :1]), -2)
+        return position + turned, derivative, 0.0
+
+    def _block(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        ranges: Float[Tensor, "B N T P"],
+        mask: Bool[Tensor, "B N T P"],
+        points: Float[Tensor, "B N #T P d"],
+        derivatives: bool,
+    ) -> tuple[Block, Float[Tensor, "B N T P d"]]:
+        """The block of all (own tag, point) pairs, and the unit vectors from point to tag."""
+        tags, derivative, spread = self._own_tags(process, x)
+        apart = tags.unsqueeze(-2) - points
+        distance = torch.linalg.vector_norm(apart, dim=-1).clamp_min(1e-9)
+        unit = apart / distance.unsqueeze(-1)
+        jacobian = x.new_zeros(0)
+        if derivatives:
+            jacobian = x.new_zeros(*unit.shape[:-1], process.error_size)
+            jacobian[..., : process.dim] = unit
+            if derivative is not None:
+                jacobian[..., process.attitude_error] = unit @ derivative
+            jacobian = jacobian.flatten(-3, -2).unsqueeze(-2)
+        residual = (ranges - distance).flatten(-2).unsqueeze(-1)
+        block = Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=x.new_tensor(self.variance + spread).expand_as(residual),
+            mask=mask.flatten(-2),
+        )
+        return block, unit
+
+
+class AnchorRanges(_Ranges):
+    """Distances to anchors at known positions."""
+
+    def __init__(self, sensor: AnchorRanging) -> None:
+        super().__init__(sensor.noise.std, sensor.tags)
+        self.n_tags = sensor.n_tags
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        anchors = observation["anchor_map"].to(x.dtype).unflatten(-1, (-1, process.dim))
+        shape = (self.n_tags, anchors.shape[-2])
+        ranges = observation["anchor_ranges"].to(x.dtype).unflatten(-1, shape)
+        mask = (observation["anchor_range_mask"] > 0).unflatten(-1, shape)
+        return self._block(process, x, ranges, mask, anchors.unsqueeze(-3), derivatives)[0]
+
+
+class UavRanges(_Ranges):
+    """Distances to neighbours, whose position is known as well as ``neighbours`` says.
+
+    A neighbour's attitude is not in its message: its tag's lever arm counts as noise.
+    """
+
+    cooperative = True
+
+    def __init__(self, sensor: Ranging) -> None:
+        super().__init__(sensor.noise.std, sensor.tags)
+        self.n_tags, self.latency = sensor.n_tags, sensor.latency
+        arms = torch.tensor(sensor.tags, dtype=torch.float64) if sensor.tags else None
+        self.their_arms = 0.0 if arms is None else float((arms**2).sum(-1).mean()) / arms.shape[-1]
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        t, s = self.n_tags, neighbours.known.shape[-1]
+
+        def by_own_tag(leaf: Tensor) -> Tensor:  # [B, N, S·T·T] → [B, N, T, S·T]
+            return leaf.unflatten(-1, (s, t, t)).transpose(-3, -2).flatten(-2)
+
+        points = neighbours.position.repeat_interleave(t, -2).unsqueeze(-3)
+        known = neighbours.known.repeat_interleave(t, -1).unsqueeze(-2)
+        mask = (by_own_tag(observation["range_mask"]) > 0) & known
+        ranges = by_own_tag(observation["ranges"].to(x.dtype))
+        block, unit = self._block(process, x, ranges, mask, points, derivatives)
+        variance = neighbours.variance.repeat_interleave(t, -2).unsqueeze(-3)
+        added = (unit**2 * variance).sum(-1) + self.their_arms
+        return Block(
+            residual=block.residual,
+            jacobian=block.jacobian,
+            variance=block.variance,
+            mask=block.mask,
+            partner=-unit.flatten(-3, -2).unsqueeze(-2),
+            partner_variance=added.flatten(-2).unsqueeze(-1),
+            per_slot=t,
+            mutual=True,
+        )
