@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from coloc_env.render.style import GRID, INK, MUTED, uav_colours
@@ -42,6 +43,7 @@ STYLE: dict[Any, Any] = {
 }
 _BOUND: dict[str, Any] = {"color": "black", "linestyle": (0, (5, 3)), "linewidth": 1.3, "zorder": 5}
 _TRUTH: dict[str, Any] = {"color": "#c4cad6", "linewidth": 5}
+_SHOWN = 100.0  # s of a run that a picture of trajectories shows at most
 _IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
 
 
@@ -56,7 +58,10 @@ def draw(results: Results, folder: Path) -> None:
     )
     for name, drawing in zip(FIGURES, drawings, strict=True):
         with mpl.rc_context(STYLE):
-            drawing(results).savefig(folder / name, dpi=150)
+            figure = drawing(results)
+            # A legend may be wider than the figure: grow the page, never crop it.
+            page = Bbox.union([figure.bbox_inches, figure.get_tightbbox()])
+            figure.savefig(folder / name, dpi=150, bbox_inches=page)
 
 
 def error_over_time(results: Results) -> Figure:
@@ -157,17 +162,19 @@ def consistency(results: Results) -> Figure:
 
 
 def trajectories(results: Results) -> Figure:
-    """Truth and estimates of the first run: plan, and height over time."""
+    """Truth and estimates in the last 100 s of the first run: plan, and height over time."""
     deep = results.scenario.arena.dim == 3
+    last = slice(-round(_SHOWN / results.dt), None)
     figure = Figure(figsize=(10.5 if deep else 6.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2 if deep else 1, squeeze=False)[0]
-    shown = results.scored[0][..., None]
-    truth = np.where(shown, results.truth[0], np.nan)
+    shown = results.scored[0, last][..., None]
+    truth = np.where(shown, results.truth[0, last], np.nan)
     tracks = [(truth, _TRUTH)]
     for name, look in _looks(results).items():
-        tracks.append((truth + results.agents[name].offset[0], look | {"linewidth": 1.0}))
-    title, time = f"Seed {results.seed}", np.broadcast_to(_time(results)[:, None], truth.shape[:2])
+        tracks.append((truth + results.agents[name].offset[0, last], look | {"linewidth": 1.0}))
+    title = f"Seed {results.seed}"
+    time = np.broadcast_to(_time(results)[last, None], truth.shape[:2])
     plan = slice(0, _IN_PLAN)
     for position, look in tracks:
         panels[0].plot(position[:, plan, 0], position[:, plan, 1], **look)
