@@ -12,6 +12,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.geometry import rotate_by
 from coloc_env.motion import Carry, Kinematics
+from coloc_env.observation import action_width
 from coloc_env.scenario import Prior, Scenario
 from coloc_env.sensors.base import Window
 
@@ -52,16 +53,15 @@ class Frame(NamedTuple):
 
     ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
     on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
-    ``senders[…, s]`` (None: from UAV s); ``unheard`` and ``heard`` say where none gets through.
+    ``senders[…, s]`` (None: from UAV s); ``heard`` says where one gets through, ``unheard`` which
+    of all slots' numbers stay 0.
     """
 
     target: Float32[Tensor, "R N d"]
-    steps: Int64[Tensor, "R"]
     over: Bool[Tensor, "R"]
-    alive: Bool[Tensor, "R N"]
     failed: Bool[Tensor, "R N"]
     scored: Bool[Tensor, "R N"]
-    unheard: Bool[Tensor, "R N S 1"]
+    unheard: Bool[Tensor, "R N S*A"]
     heard: Float32[Tensor, "R N S"]
     senders: Int64[Tensor, "R N S"] | None
 
@@ -79,7 +79,7 @@ class Sensed(_Rows):
     alive: Bool[Tensor, "R K N"]
     failed: Bool[Tensor, "R K N"]
     scored: Bool[Tensor, "R K N"]
-    unheard: Bool[Tensor, "R K N S 1"]
+    unheard: Bool[Tensor, "R K N S*A"]
     heard: Float32[Tensor, "R K N S"]
     senders: Int64[Tensor, "R K N S"] | None
     leaves: dict[str, Float32[Tensor, "R K N F"]]
@@ -184,7 +184,7 @@ def sense(
         alive=alive,
         failed=steps.unsqueeze(-1) == fails_at,
         scored=alive if moved.valid is None else alive & moved.valid,
-        unheard=~heard.unsqueeze(-1),
+        unheard=~heard.repeat_interleave(action_width(scenario), -1),
         heard=leaves["links"].clone(),
         senders=None if dense else neighbours,
         leaves=leaves,

@@ -20,7 +20,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
 
 _AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: more would not be faster
-_LONGEST = 256  # steps sensed ahead at most: a reset throws away what was not used
+_LONGEST = 512  # steps sensed ahead at most: a reset throws away what was not used
 _NEVER = 1 << 62
 
 
@@ -70,6 +70,7 @@ class World:
         self._width = action_width(scenario)
         self._static_names = tuple(static_leaves(scenario))
         self.cursor = -1
+        self._zero = torch.zeros((), device=self.device)
         self._sent: deque[Tensor] = deque(maxlen=self._delay + 1)
 
     # ---------------------------------------------------------------- reset
@@ -214,7 +215,7 @@ class World:
 
     @property
     def now(self) -> Frame:
-        """Progress, who counts and who hears whom at the current step."""
+        """What is scored, who counts and who hears whom at the current step."""
         return self.sensed.frames[self.cursor]
 
     @property
@@ -226,12 +227,12 @@ class World:
     @property
     def alive(self) -> Bool[Tensor, "B N"]:
         """UAVs that have not failed."""
-        return self.now.alive
+        return self.sensed.alive[:, self.cursor]
 
     @property
     def step_index(self) -> Int64[Tensor, "B"]:
         """The step each row is at: 0 after its reset."""
-        return self.now.steps
+        return self.sensed.steps[:, self.cursor]
 
     @property
     def static(self) -> dict[str, Float32[Tensor, "B N F"]]:
@@ -250,15 +251,15 @@ class World:
             return now.heard.new_zeros(b, n, slots * self._width), torch.zeros_like(now.heard)
         sent, heard, unheard = self._sent[0], now.heard, now.unheard
         if self._since_reset <= self._delay:
-            early = (now.steps <= self._delay)[:, None, None]
-            heard, unheard = heard.masked_fill(early, 0.0), unheard | early.unsqueeze(-1)
+            early = (self.step_index <= self._delay)[:, None, None]
+            heard, unheard = heard.masked_fill(early, 0.0), unheard | early
         if now.senders is None:
-            content = sent.unsqueeze(1)
+            content = sent.view(len(sent), 1, -1)
         else:
             rows = torch.arange(len(sent), device=self.device)[:, None, None]
-            content = sent[rows, now.senders]
-        # Filled, not multiplied: a diverged sender's NaN reaches only those who hear it.
-        return content.masked_fill(unheard, 0.0).flatten(-2), heard
+            content = sent[rows, now.senders].flatten(-2)
+        # Chosen, not multiplied: a diverged sender's NaN reaches only those who hear it.
+        return torch.where(unheard, self._zero, content), heard
 
     def observation(self) -> Observation:
         """What every UAV observes at the current step."""

@@ -181,7 +181,6 @@ def textbook(seed: int, steps: int, cooperate: bool) -> Iterator[tuple[np.ndarra
         h, r, z = rows(seen, cooperate)
         if len(z):
             team.dim_z = len(z)
-            team._I = np.eye(len(team.x))
             team.update(z.reshape(-1, 1), R=r, H=h)
         yield team.x[:, 0].copy(), team.P.copy()
 
