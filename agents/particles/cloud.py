@@ -42,12 +42,18 @@ def weighted_covariance(
 def systematic(
     weights: Float32[Tensor, "B N M"], offset: Float32[Tensor, "B N"]
 ) -> Int64[Tensor, "B N M"]:
-    """Systematic resampling (Kitagawa 1996): ancestors of M equally weighted particles."""
+    """Systematic resampling (Kitagawa 1996): ancestors of M equally weighted particles.
+
+    Rung i stands at (i + offset) / M; its ancestor's number is that of the particles whose
+    cumulative weight lies below, so counting where those fall replaces M searches.
+    """
     m = weights.shape[-1]
     cumulative = weights.double().cumsum(-1)
-    cumulative = cumulative / cumulative[..., -1:]
-    rungs = torch.arange(m, device=weights.device) + offset.double().unsqueeze(-1)
-    return torch.searchsorted(cumulative, rungs / m).clamp_max(m - 1)
+    height = cumulative * (m / cumulative[..., -1:]) - offset.double().unsqueeze(-1)
+    first = (height.floor() + 1).clamp_(0, m).to(torch.int64)  # the first rung above each particle
+    passed = torch.zeros(*weights.shape[:-1], m + 1, dtype=torch.int64, device=weights.device)
+    passed.scatter_add_(-1, first, torch.ones_like(first))
+    return passed[..., :m].cumsum(-1).clamp_max_(m - 1)
 
 
 def liu_west(

@@ -59,9 +59,14 @@ def range_log_likelihood(
     block: Block, ranges: Float32[Tensor, "B N S"], particles: Tensor, points: Tensor
 ) -> Float32[Tensor, "B N M"]:
     """−Σ (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre."""
-    distance = torch.cdist(particles, points, compute_mode="donot_use_mm_for_euclid_dist")
+    squared: Tensor | None = None
+    for own, theirs in zip(particles.unbind(-1), points.unbind(-1), strict=True):
+        apart = own.unsqueeze(-2) - theirs.unsqueeze(-1)  # [B, N, S, M]
+        squared = apart.mul_(apart) if squared is None else squared.addcmul_(apart, apart)
+    assert squared is not None
+    residual = squared.sqrt_().sub_(ranges.unsqueeze(-1))
     weight = block.mask / block.total_variance[..., 0]
-    return ((distance - ranges.unsqueeze(-2)) ** 2 @ weight.unsqueeze(-1))[..., 0] * -0.5
+    return (weight.unsqueeze(-2) @ residual.square_())[..., 0, :] * -0.5
 
 
 def log_likelihood(
