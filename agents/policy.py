@@ -35,6 +35,7 @@ class ParallelPolicy:
         self.agents = None if agents is None else tuple(agents)
         believed = localizer.believed
         layout = Layout(believed.arena, believed.slots)
+        self._arms_differ = any(getattr(sensor, "tags", ()) for sensor in believed.sensors)
         self._constant = {"prior"}.union(*(s.map_leaves(layout) for s in believed.sensors))
         self.reset()
 
@@ -54,6 +55,11 @@ class ParallelPolicy:
         if begins and len(present) < len(team):
             missing = next(agent for agent in team if agent not in observations)
             raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
+        if begins and self._arms_differ and len(team) < self.localizer.believed.arena.n_uavs:
+            raise ValueError(
+                f"{self.localizer.name}: this team's UWB lever arms differ from UAV to UAV, so one "
+                "localizer must act for all of them"
+            )
         if not present:
             return {}
         for agent in team:

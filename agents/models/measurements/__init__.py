@@ -1,16 +1,20 @@
 """Measurement models: for each sensor a team believes in, residuals and their Jacobians."""
 
+from collections.abc import Callable
+from typing import Any
+
 from agents.models.measurements.base import Block, Measurement, Neighbours, heard
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, Slowness
-from coloc_env.scenario import Believed, ConstantVelocity
+from coloc_env.scenario import Believed, ConstantVelocity, Wheeled
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
     LandmarkBearings,
     Landmarks,
     Ranging,
+    Sensor,
     SlowFlight,
     UavBearings,
 )
@@ -30,28 +34,27 @@ __all__ = [
     "make_measurements",
 ]
 
+_MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
+    AnchorRanging: AnchorRanges,
+    Height: Heights,
+    LandmarkBearings: LandmarkRangeBearings,
+    Landmarks: LandmarkVectors,
+    Ranging: UavRanges,
+    SlowFlight: Slowness,
+    UavBearings: UavRangeBearings,
+}
 _BODY_FRAME = (Landmarks, LandmarkBearings, UavBearings)
 
 
 def make_measurements(believed: Believed) -> list[Measurement]:
-    """A model for every believed sensor that measures position, attitude or other UAVs."""
-    models: list[Measurement] = []
+    """A model for every believed sensor that measures position, attitude or other UAVs.
+
+    Raises ValueError for a sensor of what the believed motion does not have as a state.
+    """
     for sensor in believed.sensors:
-        if isinstance(sensor, _BODY_FRAME) and isinstance(believed.process, ConstantVelocity):
-            name = type(sensor).__name__
+        name, process = type(sensor).__name__, believed.process
+        if isinstance(sensor, _BODY_FRAME) and isinstance(process, ConstantVelocity):
             raise ValueError(f"{name} are in the body frame: the motion model has no attitude")
-        if isinstance(sensor, Landmarks):
-            models.append(LandmarkVectors(sensor))
-        elif isinstance(sensor, AnchorRanging):
-            models.append(AnchorRanges(sensor))
-        elif isinstance(sensor, Ranging):
-            models.append(UavRanges(sensor))
-        elif isinstance(sensor, LandmarkBearings):
-            models.append(LandmarkRangeBearings(sensor))
-        elif isinstance(sensor, UavBearings):
-            models.append(UavRangeBearings(sensor))
-        elif isinstance(sensor, Height):
-            models.append(Heights(sensor))
-        elif isinstance(sensor, SlowFlight):
-            models.append(Slowness(sensor))
-    return models
+        if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled):
+            raise ValueError(f"{name} is about velocity, which is no state of wheeled motion")
+    return [_MODELS[type(s)](s) for s in believed.sensors if type(s) in _MODELS]
