@@ -205,7 +205,7 @@ class World:
 
     def advance(self, estimates: Float32[Tensor, "B N A"]) -> None:
         """Send (copies of) the estimates as messages and move to the next step."""
-        self._sent.append(estimates.clone())
+        self._sent.append(estimates.clone(memory_format=torch.contiguous_format))
         self.cursor += 1
         self._since_reset += 1
         if self.cursor == self.sensed.count:

@@ -50,7 +50,8 @@ def systematic(
     m = weights.shape[-1]
     cumulative = weights.double().cumsum(-1)
     height = cumulative * (m / cumulative[..., -1:]) - offset.double().unsqueeze(-1)
-    first = (height.floor() + 1).clamp_(0, m).to(torch.int64)  # the first rung above each particle
+    # The first rung above each particle; a UAV whose weights are NaN gets some ancestors, too.
+    first = (height.floor() + 1).nan_to_num_().clamp_(0, m).to(torch.int64)
     passed = torch.zeros(*weights.shape[:-1], m + 1, dtype=torch.int64, device=weights.device)
     passed.scatter_add_(-1, first, torch.ones_like(first))
     return passed[..., :m].cumsum(-1).clamp_max_(m - 1)
