@@ -19,7 +19,6 @@ class Prior:
 
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
     world; ``kind="uniform"`` tells nothing of the position but that it lies in the arena.
-    ``yaw_only``: the attitude's error is about the vertical alone.
     """
 
     position_std: float = 2.0
@@ -69,7 +68,7 @@ S = TypeVar("S", bound=Sensor)
 class Believed:
     """All that localizers may know: geometry, time step, motion and noise models, never the truth.
 
-    ``anchors_known``: map positions come in the observation's map leaves.
+    Positions of landmarks and anchors come in the observation's map leaves.
     """
 
     arena: Arena
