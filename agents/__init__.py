@@ -3,6 +3,8 @@
 from agents import ekf as _ekf  # noqa: F401
 from agents import ekf_joint as _ekf_joint  # noqa: F401
 from agents import pf as _pf  # noqa: F401
+from agents import pfnn as _pfnn  # noqa: F401
+from agents import trusting as _trusting  # noqa: F401
 from agents.localizer import LOCALIZERS, Estimate, Localizer, make, options_of, register
 
 __all__ = ["LOCALIZERS", "Estimate", "Localizer", "make", "options_of", "register"]

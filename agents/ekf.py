@@ -18,30 +18,23 @@ from torch import Tensor
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
-from agents.models.robust import Robust, check_gate, weigh
 from agents.models.update import information, iterated_update, posterior
+from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-_OMEGA = (
-    1.0,
-    0.99,
-    0.97,
-    0.93,
-    0.87,
-    0.8,
-    0.7,
-    0.55,
-    0.4,
-)  # weights tried by covariance intersection
+# Weights tried by covariance intersection.
+_OMEGA = (1.0, 0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)
 
 
 class GaussianBelief(TensorClass):
-    """Mean state, error covariance (float64) and steps taken; batch (B, N)."""
+    """Mean state, error covariance (float64), steps taken, and what a screen remembers of earlier
+    measurements; batch (B, N)."""
 
     state: Float[Tensor, "B N S"]
     covariance: Float[Tensor, "B N E F"]
     step: Int64[Tensor, "B N"]
+    memory: Float[Tensor, "B N K"]
 
 
 def elapsed(process: Process, step: Int64[Tensor, "B N"]) -> Float[Tensor, "B N"]:
@@ -84,37 +77,50 @@ class DeadReckoning(Localizer[GaussianBelief]):
 
     def reset(self, observation: Observation) -> GaussianBelief:
         x, covariance = self.process.initial(observation["prior"].double())
-        step = torch.zeros(x.shape[:2], dtype=torch.int64, device=x.device)
-        return GaussianBelief(state=x, covariance=covariance, step=step, batch_size=x.shape[:2])
+        return GaussianBelief(
+            state=x,
+            covariance=covariance,
+            step=torch.zeros(x.shape[:2], dtype=torch.int64, device=x.device),
+            memory=self.memory(observation),
+            batch_size=x.shape[:2],
+        )
 
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
         x, covariance = predict(self.process, belief, observation)
-        x, covariance = self.update(x, covariance, observation)
+        prior = Prediction(x, covariance, observation, belief.memory)
+        x, covariance, memory = self.update(prior)
         after = GaussianBelief(
-            state=x, covariance=covariance, step=belief.step + 1, batch_size=x.shape[:2]
+            state=x,
+            covariance=covariance,
+            step=belief.step + 1,
+            memory=memory,
+            batch_size=x.shape[:2],
         )
         return after, gaussian_estimate(self.process, x, covariance)
 
+    def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
+        """What is remembered of measurements before the first: nothing."""
+        return observation["prior"][..., :0]
+
     def update(
-        self,
-        x: Float[Tensor, "B N S"],
-        covariance: Float[Tensor, "B N E E"],
-        observation: Observation,
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        self, prior: Prediction
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
         """Use the observation's measurements: none here."""
-        return x, covariance
+        return prior.state, prior.covariance, prior.memory
 
 
 @register("ekf")
 class CooperativeEkf(DeadReckoning):
     """Cooperative error-state EKF, one per UAV, fed by neighbours' messages.
 
-    ``robust``: ``huber`` (reweighted at every iteration) or ``gate`` (innovations outside the χ²
-    quantile ``gate`` are dropped). ``fusion``: ``naive``, or ``ci`` (split covariance intersection
-    for everything that involves a neighbour). ``iterations`` of each update. ``cooperate=false``
-    leaves other UAVs out.
+    ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration;
+    ``gate`` drops innovations outside the χ² quantile ``gate``, ``ransac`` landmarks that do not
+    agree with most others, ``temporal`` what does not agree with the last two steps, ``cross`` what
+    neighbours' measurements contradict. ``fusion``: ``naive``, or ``ci`` (split covariance
+    intersection for everything that involves a neighbour). ``iterations`` of each update.
+    ``cooperate=false`` leaves other UAVs out.
     """
 
     name = "ekf"
@@ -123,7 +129,7 @@ class CooperativeEkf(DeadReckoning):
         self,
         believed: Believed,
         *,
-        robust: Robust = "none",
+        robust: str = "none",
         gate: float = 0.999,
         fusion: Literal["naive", "ci"] = "naive",
         iterations: int = 2,
@@ -131,59 +137,79 @@ class CooperativeEkf(DeadReckoning):
     ) -> None:
         super().__init__(believed)
         if iterations < 1:
-            raise ValueError(f"ekf: iterations={iterations} is not allowed: at least 1")
-        check_gate(gate)
-        self.robust, self.gate, self.iterations = robust, gate, iterations
-        models = make_measurements(believed)
-        own = [m for m in models if not m.cooperative]
-        shared = [m for m in models if m.cooperative and cooperate]
-        self.first = own if fusion == "ci" else own + shared
-        self.intersected = shared if fusion == "ci" else []
+            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
+        self.iterations, self.fusion = iterations, fusion
+        self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
+        self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+
+    @property
+    def exchanges(self) -> bool:
+        return self.screen.exchanges
+
+    def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
+        return self.screen.memory(observation)
 
     def update(
-        self,
-        x: Float[Tensor, "B N S"],
-        covariance: Float[Tensor, "B N E E"],
-        observation: Observation,
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-        neighbours = heard(self.believed, observation)
+        self, prior: Prediction
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
+        if not self.models:
+            return super().update(prior)
+        neighbours = heard(self.believed, prior.observation)
 
         def linearize(at: Tensor) -> Sequence[Block]:
-            return [m.linearize(self.process, at, observation, neighbours) for m in self.first]
+            return [
+                m.linearize(self.process, at, prior.observation, neighbours) for m in self.models
+            ]
 
-        prior = covariance
-        if self.first:
-            x, covariance = iterated_update(
-                self.process,
-                x,
-                covariance,
-                linearize,
-                lambda blocks, last: weigh(self.robust, self.gate, blocks, prior, last),
-                self.iterations,
-            )
-        if self.intersected:
-            x, covariance = self._intersect(x, covariance, observation, neighbours)
+        found = iterated_update(prior, linearize, self.screen, self.iterations)
+        if self.fusion == "naive":
+            return found.state, found.covariance, found.memory
+        x, covariance = self._split(prior, neighbours, found.trusts)
+        return x, covariance, found.memory
+
+    def _split(
+        self, prior: Prediction, neighbours: Neighbours, trusts: Sequence[Trust]
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        """First the UAV's own measurements, then an intersection with what involves neighbours;
+        each trusted as in the naive update."""
+        pairs = list(zip(self.models, trusts, strict=True))
+        own = [pair for pair in pairs if not pair[0].cooperative]
+        shared = [pair for pair in pairs if pair[0].cooperative]
+        x, covariance = prior.state, prior.covariance
+        if own:
+            models, fixed = zip(*own, strict=True)
+
+            def linearize(at: Tensor) -> Sequence[Block]:
+                return [
+                    m.linearize(self.process, at, prior.observation, neighbours) for m in models
+                ]
+
+            screen = Fixed(self.process, models, fixed)
+            found = iterated_update(prior, linearize, screen, self.iterations)
+            x, covariance = found.state, found.covariance
+        if shared:
+            models, fixed = zip(*shared, strict=True)
+            blocks = [m.linearize(self.process, x, prior.observation, neighbours) for m in models]
+            x, covariance = self._intersect(x, covariance, blocks, fixed)
         return x, covariance
 
     def _intersect(
         self,
         x: Float[Tensor, "B N S"],
         covariance: Float[Tensor, "B N E E"],
-        observation: Observation,
-        neighbours: Neighbours,
+        blocks: Sequence[Block],
+        trusts: Sequence[Trust],
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
         """Split covariance intersection (Julier & Uhlmann 2001; Li & Nashashibi 2013): own
         covariance over ω, the neighbours' over 1 − ω, ω chosen for the least position variance."""
         d = self.process.dim
-        blocks = [m.linearize(self.process, x, observation, neighbours) for m in self.intersected]
-        weights = weigh(self.robust, self.gate, blocks, covariance, None)
         best: tuple[Tensor, Tensor, Tensor] | None = None
         for omega in _OMEGA:
             if omega == 1.0:
                 delta, updated = torch.zeros_like(covariance[..., 0]), covariance
             else:
                 apart = [_inflated(block, 1 - omega) for block in blocks]
-                delta, updated = posterior(covariance / omega, *information(apart, weights))
+                delta, updated = posterior(covariance / omega, *information(apart, trusts))
             trace = updated[..., :d, :d].diagonal(dim1=-2, dim2=-1).sum(-1)
             if best is None:
                 best = (trace, delta, updated)

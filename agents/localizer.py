@@ -61,6 +61,12 @@ class Localizer(ABC, Generic[Belief]):
         Pure: neither argument is written to.
         """
 
+    @property
+    def exchanges(self) -> bool:
+        """Whether UAVs look at what linked neighbours measured, which messages do not carry: one
+        localizer must then act for the whole team."""
+        return False
+
     def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
         """A method's own figures at this step (particles, effective sample size, …)."""
         return {}

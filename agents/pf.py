@@ -2,56 +2,83 @@
 
 Gordon, Salmond & Smith 1993; resampling when the effective sample size falls below half.
 Neighbours' messages enter as ranges whose variance is inflated by the sender's own uncertainty.
+Particles live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper,
+Algorithms 1 and 2).
 """
 
-import math
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
-from agents.models.measurements import heard, make_measurements
+from agents.models.measurements import Block, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
+from agents.models.update import iterated_update
+from agents.particles import population
 from agents.particles.cloud import (
+    Moments,
     effective_sample_size,
     liu_west,
     moments,
+    normalized,
     select,
     systematic,
-    weighted_covariance,
 )
 from agents.particles.likelihood import log_likelihood
 from agents.particles.tempering import increment
+from agents.robust import Prediction, RobustScreen, Screen, Trust
 from coloc_env import noise
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
 Perturb = Literal["liu_west", "fixed"]
+Proposal = Literal["prior", "ekf"]
 
 # Standard deviations that keep a resampled cloud from collapsing (specs: Liu-West's floor, and the
 # smallest fixed perturbation that loses no UAV): m, m/s, rad, m/s², rad/s.
 _FLOOR = {"position": 0.005, "velocity": 0.005, "attitude": 0.0015, "accel": 0.002, "gyro": 0.0002}
 _FIXED = {"position": 0.03, "velocity": 0.03, "attitude": 0.01, "accel": 0.01, "gyro": 0.001}
-_RESAMPLE = 0.5  # share of M below which the effective sample size triggers resampling
+_RESAMPLE = 0.5  # share of the count below which the effective sample size triggers resampling
 _START_STEPS = 3  # steps in which the likelihood is tempered down to that share
 _RESCUE = 0.1  # the share below which it is tempered later
-_STAGES = 40  # more than any likelihood has needed
+_STAGES = 5  # of a likelihood at most; what is left then is used at once
+_START_STAGES = 40  # in the first steps: more than any likelihood has needed
+_WIDEN = 1.1  # of the guided proposal's covariance
+_ITERATIONS = 3  # of the update that screens measurements and guides proposals
 
 
 class ParticleBelief(TensorClass):
-    """Particles (float32) with normalized log-weights, the UAV's own random key, steps taken, and
-    the last effective sample size; batch (B, N)."""
+    """Particles (float32) with normalized log-weights (−∞ for slots beyond ``count``), the UAV's
+    own random key, steps taken, the last effective sample size as a share of its count, position
+    and velocity of the last estimate (of the prior before), and what the screen remembers; batch
+    (B, N)."""
 
     particles: Float32[Tensor, "B N M S"]
     log_weights: Float32[Tensor, "B N M"]
+    count: Int64[Tensor, "B N"]
     key: Int64[Tensor, "B N"]
     step: Int64[Tensor, "B N"]
-    ess: Float32[Tensor, "B N"]
+    ess_share: Float32[Tensor, "B N"]
+    last: Float32[Tensor, "B N 2*d"]
+    memory: Float[Tensor, "B N K"]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a step's evidence is made from."""
+
+    belief: ParticleBelief
+    observation: Observation
+    neighbours: Neighbours
+    trusts: Sequence[Trust]
+    key: Int64[Tensor, "B N"]
 
 
 def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
@@ -62,12 +89,25 @@ def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
     return noise.fold(noise.fold(bits, index).sum(-1), seed)
 
 
+def _normal(
+    key: Int64[Tensor, "B N"], stream: str, components: int, slots: int
+) -> Float32[Tensor, "B N M E"]:
+    """Standard normal numbers for each slot, whatever the number of slots beside it; in the memory
+    order of ``geometry.join``."""
+    which = torch.arange(components, device=key.device).view(-1, 1, 1)
+    return noise.normal(noise.fold(key, which), stream, slots).movedim(0, -1)
+
+
 class ParticleFilter(Localizer[ParticleBelief]):
-    """Bootstrap filter with a fixed number of particles.
+    """Bootstrap filter; its number of particles is fixed unless ``bounds`` let it adapt.
 
     ``perturb``: ``liu_west`` moves resampled particles so that the cloud keeps its moments, above a
     small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). ``tempering=false`` uses
-    every likelihood at once, however few particles survive it.
+    every likelihood at once, however few particles survive it. ``proposal=ekf`` draws from 1.1 ×
+    an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003).
+    ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
+    ``compile=true`` compiles the step's two large parts at the first step (it takes up to a minute
+    and needs a C++ compiler); the numbers then differ in their last digits.
     """
 
     name = "pf"
@@ -75,40 +115,64 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def __init__(
         self,
         believed: Believed,
+        *,
         particles: int,
-        seed: int,
-        perturb: Perturb,
-        tempering: bool,
-        cooperate: bool,
+        bounds: tuple[int, int] | None = None,
+        seed: int = 0,
+        perturb: Perturb = "liu_west",
+        tempering: bool = True,
+        proposal: Proposal = "prior",
+        robust: str = "none",
+        gate: float = 0.999,
+        cooperate: bool = True,
+        compile: bool = False,
     ) -> None:
         super().__init__(believed)
         if particles < 10:
             raise ValueError(f"particles={particles} is not allowed: at least 10")
+        if bounds is not None and not 10 <= bounds[0] <= particles <= bounds[1]:
+            raise ValueError(
+                f"bounds={bounds} is not allowed: low,high with 10 ≤ low ≤ particles ({particles}) "
+                "≤ high"
+            )
         self.particles, self.seed, self.tempering = particles, seed, tempering
+        self.bounds, self.proposal = bounds, proposal
+        self.capacity = particles if bounds is None else bounds[1]
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
+        self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        self.screens = robust != "none"
         self.shrink, std = (0.7, _FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
-        self.floor = torch.tensor(_per_error(self.process, std))
+        self.floor = torch.tensor(_per_error(self.process, std), dtype=torch.float64)
+        self.compiled = compile
+        if compile:
+            self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
+            self._conclude = torch.compile(self._conclude, dynamic=False)  # type: ignore[method-assign]
 
     def reset(self, observation: Observation) -> ParticleBelief:
         prior = observation["prior"]
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
-        e, m, d = self.process.error_size, self.particles, self.process.dim
-        draws = noise.normal(key, "pf.reset", m * e).unflatten(-1, (e, m)).mT
+        m, d = self.capacity, self.process.dim
+        draws = _normal(key, "pf.reset", self.process.error_size, m)
         delta = draws * covariance.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)
         particles = self.process.boxplus(mean.unsqueeze(-2).expand(-1, -1, m, -1), delta)
         if self.believed.prior.kind == "uniform":
             arena = self.believed.arena
             low, high = (prior.new_tensor(x) for x in (arena.low, arena.high))
-            place = noise.uniform(key, "pf.place", m * d).unflatten(-1, (d, m)).mT
+            place = (_normal(key, "pf.place", d, m) * 0.5**0.5).erf() * 0.5 + 0.5
             particles = concat((low + place * (high - low), particles[..., d:]))
+        count = torch.full_like(key, self.particles)
+        live = population.alive(count, m)
         return ParticleBelief(
-            particles=particles,
-            log_weights=torch.full_like(particles[..., 0], -math.log(m)),
+            particles=torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2)),
+            log_weights=population.equal_log_weights(live),
+            count=count,
             key=key,
             step=torch.zeros_like(key),
-            ess=torch.full_like(prior[..., 0], float(m)),
+            ess_share=torch.ones_like(prior[..., 0]),
+            last=mean[..., : 2 * d],
+            memory=self.screen.memory(observation),
             batch_size=key.shape,
         )
 
@@ -116,108 +180,244 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self, belief: ParticleBelief, observation: Observation
     ) -> tuple[ParticleBelief, Estimate]:
         key = noise.fold(belief.key, belief.step)
-        particles = self._predict(belief, observation, key)
-        particles, log_weights = self._weigh(
-            particles, belief.log_weights, belief.step, observation, key
+        slots, w = self._slots(belief.count), self.process.noise_size
+        draws = _normal(key, "pf.step", w + self.process.error_size, slots)
+        u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
+        dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
+        neighbours = heard(self.believed, observation)
+        particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
+        now = _Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
+        memory = belief.memory
+        if self.models and (self.screens or self.proposal == "ekf"):
+            particles = self.process.propagate(particles, u, dt, draws[..., :w])
+            particles, log_weights, trusts, memory = self._guide(particles, log_weights, now)
+            now = replace(now, trusts=trusts)
+            gain = self._evidence(particles, log_weights, now)
+        else:
+            particles, gain = self._foresee(particles, log_weights, u, dt, draws[..., :w], now)
+        particles, log_weights = self._weigh(particles, log_weights, gain, now)
+        cloud, ess, target, few, moved = self._conclude(
+            particles, log_weights, belief.count, draws[..., w:], key
         )
-        weights, ess = log_weights.exp(), effective_sample_size(log_weights)
-        mean, apart = moments(self.process, particles, weights)
-        covariance = weighted_covariance(apart, weights)
         d = self.process.dim
-        least = torch.eye(d, device=key.device) * _FLOOR["position"] ** 2
+        least = torch.eye(d, dtype=torch.float64, device=key.device) * _FLOOR["position"] ** 2
         estimate = Estimate(
-            position=mean[..., :d],
-            velocity=mean[..., d : 2 * d],
-            covariance=covariance[..., :d, :d] + least,
+            position=cloud.mean[..., :d],
+            velocity=cloud.mean[..., d : 2 * d],
+            covariance=cloud.covariance[..., :d, :d] + least,
             batch_size=key.shape,
         )
-        few = ess < _RESAMPLE * self.particles
-        moved = self._resample(mean, apart, covariance, weights, noise.fold(key, _STAGES))
+        particles, log_weights = self._renewed(
+            particles, log_weights, belief.count, target, few, moved, cloud.mean
+        )
         after = ParticleBelief(
-            particles=torch.where(few[..., None, None], moved, particles),
-            log_weights=log_weights.masked_fill(few[..., None], -math.log(self.particles)),
+            particles=self._padded(particles, cloud.mean),
+            log_weights=torch.nn.functional.pad(
+                log_weights, (0, self.capacity - slots), value=-torch.inf
+            ),
+            count=target,
             key=belief.key,
             step=belief.step + 1,
-            ess=ess,
+            ess_share=ess / belief.count,
+            last=cloud.mean[..., : 2 * d],
+            memory=memory,
             batch_size=key.shape,
         )
         return after, estimate
 
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
-        count = torch.full_like(belief.ess, float(self.particles))
-        return {"particles": count, "ess_share": belief.ess / count}
+        return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
 
-    def _predict(
-        self, belief: ParticleBelief, observation: Observation, key: Int64[Tensor, "B N"]
+    def log_correction(
+        self, particles: Float32[Tensor, "B N M S"], belief: ParticleBelief
+    ) -> Float32[Tensor, "B N M"] | None:
+        """What a learned part adds to the log-likelihood of particles: nothing here."""
+        return None
+
+    def _slots(self, count: Int64[Tensor, "B N"]) -> int:
+        """How many slots the step works on: enough for any UAV of the batch to grow into; all of
+        them where each number would be compiled for."""
+        if self.bounds is None or self.compiled:
+            return self.capacity
+        return min(self.capacity, int(count.max()) + population.GROW)
+
+    def _padded(
+        self, particles: Float32[Tensor, "B N m S"], mean: Float32[Tensor, "B N S"]
     ) -> Float32[Tensor, "B N M S"]:
-        """Each particle moves with its own draw of the motion's noise."""
-        m, w = self.particles, self.process.noise_size
-        draws = noise.normal(key, "pf.predict", m * w).unflatten(-1, (w, m)).mT
-        u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
-        dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        return self.process.propagate(belief.particles, u, dt, draws)
+        """With the slots that the step left out, which hold the mean as dead particles do."""
+        missing = self.capacity - particles.shape[-2]
+        if not missing:
+            return particles
+        rest = mean.unsqueeze(-2).expand(*mean.shape[:-1], missing, mean.shape[-1])
+        return torch.cat((particles.movedim(-1, 0), rest.movedim(-1, 0)), -1).movedim(0, -1)
+
+    def _foresee(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        u: Float32[Tensor, "B N 1 U"],
+        dt: Float32[Tensor, "B N 1"],
+        draws: Float32[Tensor, "B N M W"],
+        now: _Step,
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """Each particle moves with its own draw of the motion's noise, and meets the evidence."""
+        particles = self.process.propagate(particles, u, dt, draws)
+        return particles, self._evidence(particles, log_weights, now)
+
+    def _guide(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        now: _Step,
+    ) -> tuple[
+        Float32[Tensor, "B N M S"],
+        Float32[Tensor, "B N M"],
+        Sequence[Trust],
+        Float[Tensor, "B N K"],
+    ]:
+        """A Gaussian update at the moments of the predicted cloud: how far to trust what was
+        measured and, with ``proposal="ekf"``, where to draw particles anew."""
+        cloud = moments(self.process, particles, log_weights.exp())
+        covariance = cloud.covariance + torch.diag(self.floor.to(cloud.covariance.device) ** 2)
+        prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
+
+        def linearize(at: Tensor) -> Sequence[Block]:
+            return [
+                m.linearize(self.process, at, now.observation, now.neighbours) for m in self.models
+            ]
+
+        found = iterated_update(prior, linearize, self.screen, _ITERATIONS)
+        if self.proposal == "prior":
+            return particles, log_weights, found.trusts, found.memory
+        slots = particles.shape[-2]
+        draws = _normal(now.key, "pf.propose", self.process.error_size, slots)
+        root = torch.linalg.cholesky_ex(_WIDEN * found.covariance).L
+        delta = (root.to(draws.dtype) @ draws.mT).mT
+        particles = self.process.boxplus(found.state.to(draws.dtype).unsqueeze(-2), delta)
+        away = self.process.boxminus(particles, cloud.mean.unsqueeze(-2)).double()
+        scaled = torch.linalg.solve_triangular(
+            torch.linalg.cholesky_ex(covariance).L, away.mT, upper=False
+        )
+        ratio = 0.5 * (draws.square().sum(-1) - scaled.square().sum(-2))
+        live = population.alive(now.belief.count, slots)
+        log_weights = torch.where(live, ratio, -torch.inf).log_softmax(-1).to(draws.dtype)
+        return particles, log_weights, found.trusts, found.memory
 
     def _weigh(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
-        step: Int64[Tensor, "B N"],
-        observation: Observation,
-        key: Int64[Tensor, "B N"],
+        gain: Float32[Tensor, "B N M"],
+        now: _Step,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Use the step's likelihood; where it would leave too few particles, in stages with a
-        resampling move after each. A UAV that needs no stages is not touched by others that do."""
-        neighbours = heard(self.believed, observation)
-
-        def evidence() -> Float32[Tensor, "B N M"]:
-            centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
-            return log_likelihood(
-                self.models, self.process, particles, centre, observation, neighbours
-            )
-
-        gain = evidence()
-        threshold = torch.where(step < _START_STEPS, _RESAMPLE, _RESCUE) * self.particles
+        """Use the evidence; where it would leave too few particles, in stages with a resampling
+        move after each. A UAV that needs no stages is not touched by others that do."""
+        count = now.belief.count
+        threshold = torch.where(now.belief.step < _START_STEPS, _RESAMPLE, _RESCUE) * count
         staged = effective_sample_size(log_weights + gain) < threshold
         if not (self.tempering and bool(staged.any())):
-            return particles, (log_weights + gain).log_softmax(-1)
+            return particles, normalized(log_weights + gain)
+        equal = population.equal_log_weights(population.alive(count, particles.shape[-2]))
         left = torch.ones_like(gain[..., 0])
-        for stage in range(_STAGES):
-            share = left
-            if stage < _STAGES - 1:
-                share = torch.where(staged, increment(log_weights, gain, left, _RESAMPLE), left)
-            used = (log_weights + share.unsqueeze(-1) * gain).log_softmax(-1)
+        stages = torch.where(now.belief.step < _START_STEPS, _START_STAGES, _STAGES)
+        for stage in range(_START_STAGES):
+            some = increment(log_weights, gain, left, _RESAMPLE * count)
+            share = torch.where(staged & (stage + 1 < stages), some, left)
+            used = normalized(log_weights + share.unsqueeze(-1) * gain)
             log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
             left = left - share
             go_on = left > 0
             if not bool(go_on.any()):
                 break
             weights = log_weights.exp()
-            mean, apart = moments(self.process, particles, weights)
-            covariance = weighted_covariance(apart, weights)
-            moved = self._resample(mean, apart, covariance, weights, noise.fold(key, stage))
-            particles = torch.where(go_on[..., None, None], moved, particles)
-            log_weights = torch.where(
-                go_on[..., None], torch.full_like(gain, -math.log(self.particles)), log_weights
+            key = noise.fold(now.key, stage)
+            draws = _normal(key, "pf.move", self.process.error_size, weights.shape[-1])
+            moved = self._resample(
+                moments(self.process, particles, weights), weights, count, draws, key
             )
-            gain = evidence()
+            particles = torch.where(go_on[..., None, None], moved, particles)
+            log_weights = torch.where(go_on.unsqueeze(-1), equal, log_weights)
+            gain = self._evidence(particles, log_weights, now)
+        return particles, log_weights
+
+    def _evidence(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        now: _Step,
+    ) -> Float32[Tensor, "B N M"]:
+        """What the step says of each particle: log-likelihood and learned correction."""
+        centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
+        gain = log_likelihood(
+            self.models,
+            self.process,
+            particles,
+            centre,
+            now.observation,
+            now.neighbours,
+            now.trusts,
+        )
+        correction = self.log_correction(particles, now.belief)
+        return gain if correction is None else gain + correction
+
+    def _conclude(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        count: Int64[Tensor, "B N"],
+        draws: Float32[Tensor, "B N M E"],
+        key: Int64[Tensor, "B N"],
+    ) -> tuple[
+        Moments,
+        Float32[Tensor, "B N"],
+        Int64[Tensor, "B N"],
+        Bool[Tensor, "B N"],
+        Float32[Tensor, "B N M S"],
+    ]:
+        """Algorithm 2: the cloud's moments and effective sample size, the count adapted to it, who
+        must resample, and the particles that they get."""
+        weights, ess = log_weights.exp(), effective_sample_size(log_weights)
+        cloud = moments(self.process, particles, weights)
+        target = count if self.bounds is None else population.adapted(count, ess, self.bounds)
+        few = ess < _RESAMPLE * count
+        return cloud, ess, target, few, self._resample(cloud, weights, target, draws, key)
+
+    def _renewed(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        count: Int64[Tensor, "B N"],
+        target: Int64[Tensor, "B N"],
+        few: Bool[Tensor, "B N"],
+        moved: Float32[Tensor, "B N M S"],
+        mean: Float32[Tensor, "B N S"],
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """Resampled particles where there were few, the heaviest where there were many."""
+        live = population.alive(target, particles.shape[-2])
+        fewer = target < count
+        if bool(fewer.any()):
+            particles, kept = population.heaviest_first(particles, log_weights, fewer)
+            kept = normalized(kept.masked_fill(~live, -torch.inf))
+            log_weights = torch.where(fewer.unsqueeze(-1), kept, log_weights)
+        particles = torch.where(few[..., None, None], moved, particles)
+        equal = population.equal_log_weights(live)
+        log_weights = torch.where(few.unsqueeze(-1), equal, log_weights)
+        if self.bounds is not None:
+            particles = torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2))
         return particles, log_weights
 
     def _resample(
         self,
-        mean: Float32[Tensor, "B N S"],
-        apart: Float32[Tensor, "B N M E"],
-        covariance: Float32[Tensor, "B N E E"],
+        cloud: Moments,
         weights: Float32[Tensor, "B N M"],
+        count: Int64[Tensor, "B N"],
+        draws: Float32[Tensor, "B N M E"],
         key: Int64[Tensor, "B N"],
     ) -> Float32[Tensor, "B N M S"]:
         """Equally weighted particles drawn from the weighted ones, then moved apart."""
-        m, e = self.particles, self.process.error_size
-        ancestors = systematic(weights, noise.uniform(key, "pf.offset", 1)[..., 0])
-        draws = noise.normal(key, "pf.move", m * e).unflatten(-1, (e, m)).mT
+        ancestors = systematic(weights, noise.unit(key), count)
         floor = self.floor.to(draws.device)
-        return liu_west(
-            self.process, mean, select(apart, ancestors), covariance, draws, self.shrink, floor
-        )
+        return liu_west(self.process, cloud, ancestors, draws, self.shrink, floor)
 
 
 def _per_error(process: Process, std: dict[str, float]) -> list[float]:
@@ -230,21 +430,42 @@ def _per_error(process: Process, std: dict[str, float]) -> list[float]:
     return (linear + [std["attitude"]] * (turn.stop - turn.start) + biases)[: process.error_size]
 
 
-def _register(size: int) -> None:
-    @register(f"pf{size}")
-    def particle_filter(
+@register("pf500")
+class Pf500(ParticleFilter):
+    """SIR particle filter with 500 particles per UAV."""
+
+    name = "pf500"
+
+    def __init__(self, believed: Believed, *, particles: int = 500, **options: Any) -> None:
+        super().__init__(believed, particles=particles, **options)
+
+
+@register("pf800")
+class Pf800(ParticleFilter):
+    """SIR particle filter with 800 particles per UAV."""
+
+    name = "pf800"
+
+    def __init__(self, believed: Believed, *, particles: int = 800, **options: Any) -> None:
+        super().__init__(believed, particles=particles, **options)
+
+
+@register("apf")
+class AdaptiveParticleFilter(ParticleFilter):
+    """SIR particle filter that adapts its number of particles (PF-NN paper, without network).
+
+    It starts with ``particles`` and stays within ``bounds``: 100 more where the effective sample
+    size falls below 0.3 of the count, 50 fewer where it exceeds 0.8.
+    """
+
+    name = "apf"
+
+    def __init__(
+        self,
         believed: Believed,
         *,
-        particles: int = size,
-        seed: int = 0,
-        perturb: Perturb = "liu_west",
-        tempering: bool = True,
-        cooperate: bool = True,
-    ) -> ParticleFilter:
-        return ParticleFilter(believed, particles, seed, perturb, tempering, cooperate)
-
-    particle_filter.__doc__ = f"SIR particle filter with {size} particles per UAV."
-
-
-_register(500)
-_register(800)
+        particles: int = 300,
+        bounds: tuple[int, int] | None = (100, 800),
+        **options: Any,
+    ) -> None:
+        super().__init__(believed, particles=particles, bounds=bounds, **options)

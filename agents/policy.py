@@ -1,6 +1,6 @@
 """A Localizer as a policy of either face: PettingZoo's dictionaries, TorchRL's tensordicts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from coloc_env.sensors.base import Layout
 from coloc_env.world import World
 
 CARRIES = ("module", "tensordict")
+Record = Callable[[Any, Any, TensorDictBase], Mapping[str, Tensor]]
 
 
 class ParallelPolicy:
@@ -55,10 +56,16 @@ class ParallelPolicy:
         if begins and len(present) < len(team):
             missing = next(agent for agent in team if agent not in observations)
             raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
-        if begins and self._arms_differ and len(team) < self.localizer.believed.arena.n_uavs:
+        partial = begins and len(team) < self.localizer.believed.arena.n_uavs
+        if partial and self._arms_differ:
             raise ValueError(
                 f"{self.localizer.name}: this team's UWB lever arms differ from UAV to UAV, so one "
                 "localizer must act for all of them"
+            )
+        if partial and self.localizer.exchanges:
+            raise ValueError(
+                f"{self.localizer.name}: the UAVs compare what they measured, so one localizer "
+                "must act for all of them"
             )
         if not present:
             return {}
@@ -88,15 +95,25 @@ class LocalizerPolicy(TensorDictModuleBase):
     in the tensordict under ``belief`` (whose transform is ``make_tensordict_primer()``); then the
     module has no state. ``Collector(…, auto_register_policy_transforms=True)`` adds both transforms
     by itself; by hand: ``TransformedEnv(env, InitTracker())``.
+
+    ``record(belief, belief_after, tensordict)`` is called after every step, the action written, and
+    gives entries [B, …] for training, which go under ``("train", name)``.
     """
 
-    def __init__(self, localizer: Localizer, scenario: Scenario, carry: str = "module") -> None:
+    def __init__(
+        self,
+        localizer: Localizer,
+        scenario: Scenario,
+        carry: str = "module",
+        record: Record | None = None,
+    ) -> None:
         if carry not in CARRIES:
             raise ValueError(f"carry={carry!r} is not allowed: one of {', '.join(CARRIES)}")
         super().__init__()
         self.localizer = localizer
         self.scenario = scenario
         self.carry = carry
+        self.record = record
         self._leaves = tuple(all_leaves(scenario))
         self._belief: Any = None
         self.in_keys = [("uav", "observation", name) for name in self._leaves] + ["is_init"]
@@ -120,12 +137,15 @@ class LocalizerPolicy(TensorDictModuleBase):
         if self.carry == "tensordict":
             belief = _restored(self._template, tensordict["belief"], observation.batch_size)
         belief = self._start(belief, observation, begins.flatten())
-        belief, estimate = self.localizer.step(belief, observation)
+        after, estimate = self.localizer.step(belief, observation)
         tensordict["uav", "action"] = estimate.action()
+        if self.record is not None:
+            for name, value in self.record(belief, after, tensordict).items():
+                tensordict["train", name] = value
         if self.carry == "tensordict":
-            tensordict["next", "belief"] = _flat(belief)
+            tensordict["next", "belief"] = _flat(after)
         else:
-            self._belief = belief
+            self._belief = after
         return tensordict
 
     def _start(self, belief: Any, observation: Observation, rows: Tensor) -> Any:

@@ -97,6 +97,12 @@ def uniform(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float32[Tenso
     return _random(keys, stream, count, _write_uniform)
 
 
+def unit(keys: Int64[Tensor, "*s"]) -> Float32[Tensor, "*s"]:
+    """One float32 number in (0, 1) per key, from the key's own bits."""
+    bits = (keys >> 41) & 0x7FFFFF
+    return (bits.to(torch.float32) + 0.5) * 2.0**-23
+
+
 def normal(keys: Int64[Tensor, "*s"], stream: str, count: int) -> Float32[Tensor, "*s n"]:
     """``count`` standard normal float32 numbers per key."""
     return _random(keys, stream, count, _write_normal)

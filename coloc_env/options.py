@@ -15,9 +15,14 @@ _UNFIT = object()
 
 
 def parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Keyword-only parameters of a function or class, annotations evaluated."""
-    signature = inspect.signature(function, eval_str=True)
-    return {k: p for k, p in signature.parameters.items() if p.kind is p.KEYWORD_ONLY}
+    """Keyword-only parameters of a function or class, annotations evaluated; a class that takes
+    ``**options`` passes them on to the class it extends, and so has that one's, too."""
+    own = inspect.signature(function, eval_str=True).parameters
+    named = {k: p for k, p in own.items() if p.kind is p.KEYWORD_ONLY}
+    if isinstance(function, type) and any(p.kind is p.VAR_KEYWORD for p in own.values()):
+        extended = parameters(function.__mro__[1])
+        return named | {k: p for k, p in extended.items() if k not in named}
+    return named
 
 
 def check(owner: str, options: Mapping[str, Any], known: Mapping[str, inspect.Parameter]) -> None:

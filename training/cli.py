@@ -14,6 +14,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from typer.core import TyperGroup
 
+from training.cli_reproduce import reproduce
+from training.cli_train import train
+
 if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
 
@@ -212,6 +215,10 @@ def bench(
     from training.bench import bench as measure
 
     measure(out, quick)
+
+
+app.command()(train)
+app.command()(reproduce)
 
 
 # ------------------------------------------------------------------ parts

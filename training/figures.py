@@ -41,7 +41,7 @@ STYLE: dict[Any, Any] = {
     "ytick.color": MUTED,
     "ytick.labelcolor": INK,
 }
-_BOUND: dict[str, Any] = {"color": "black", "linestyle": (0, (5, 3)), "linewidth": 1.3, "zorder": 5}
+BOUND: dict[str, Any] = {"color": "black", "linestyle": (0, (5, 3)), "linewidth": 1.3, "zorder": 5}
 _TRUTH: dict[str, Any] = {"color": "#c4cad6", "linewidth": 5}
 _SHOWN = 100.0  # s of a run that a picture of trajectories shows at most
 _IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
@@ -76,9 +76,9 @@ def error_over_time(results: Results) -> Figure:
         axes.fill_between(time, *half, color=look["color"], alpha=0.12, linewidth=0)
     if results.bound is not None:
         bound = results.bound.mse.numpy() ** 0.5
-        axes.plot(time, metrics.rmse_per_step(bound, results.bound.scored.numpy()), **_BOUND)
+        axes.plot(time, metrics.rmse_per_step(bound, results.bound.scored.numpy()), **BOUND)
     axes.set(xlabel="time (s)", ylabel="position error (m)", xlim=_span(time, results.dt))
-    _log(axes.yaxis, axes.set_yscale)
+    log_axis(axes.yaxis, axes.set_yscale)
     _cut(axes.get_ylim, axes.set_ylim, _farthest(results))
     _legend(figure, results)
     return figure
@@ -94,7 +94,7 @@ def error_distribution(results: Results) -> Figure:
             axes.plot(np.quantile(errors, share), 100 * share, **look)
     _mark_bound(axes, results)
     axes.set(xlabel="position error (m)", ylabel="share of errors below (%)", ylim=(0, 100))
-    _log(axes.xaxis, axes.set_xscale)
+    log_axis(axes.xaxis, axes.set_xscale)
     _cut(axes.get_xlim, axes.set_xlim, _farthest(results))
     _legend(figure, results)
     return figure
@@ -133,7 +133,7 @@ def error_boxes(results: Results) -> Figure:
             axes.text(limit, row - 0.32, label, ha="right", fontsize=8, **line)
     _mark_bound(axes, results)
     axes.set(xlabel="RMSE (m)", ylim=(count - 0.5, -0.5))
-    _log(axes.xaxis, axes.set_xscale)
+    log_axis(axes.xaxis, axes.set_xscale)
     _cut(axes.get_xlim, axes.set_xlim, limit)
     axes.set_yticks(range(count), list(results.agents))
     axes.grid(False, axis="y")
@@ -155,7 +155,7 @@ def consistency(results: Results) -> Figure:
     axes.fill_between(time, low, high, color=MUTED, alpha=0.25, linewidth=0, zorder=0)
     axes.axhline(dim, color=INK, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="NEES of the position", xlim=_span(time, results.dt))
-    _log(axes.yaxis, axes.set_yscale)
+    log_axis(axes.yaxis, axes.set_yscale)
     _cut(axes.get_ylim, axes.set_ylim, 1000 * dim)
     _legend(figure, results, bound=False)
     return figure
@@ -225,7 +225,7 @@ def _legend(
     looks = _looks(results).items()
     lines = [*handles, *(Line2D([], [], label=x, color=y["color"], lw=2) for x, y in looks)]
     if bound and results.bound is not None:
-        lines.append(Line2D([], [], label="bound", **_BOUND))
+        lines.append(Line2D([], [], label="bound", **BOUND))
     letters = sum(len(str(line.get_label())) + 6 for line in lines)
     columns = len(lines) if letters < 14 * figure.get_figwidth() else 3
     figure.legend(handles=lines, loc="outside lower center", ncols=columns)
@@ -233,10 +233,10 @@ def _legend(
 
 def _mark_bound(axes: Axes, results: Results) -> None:
     if results.bound is not None:
-        axes.axvline(results.bound.rmse, **_BOUND)
+        axes.axvline(results.bound.rmse, **BOUND)
 
 
-def _log(axis: Any, set_scale: Callable[[str], None]) -> None:
+def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
     """A logarithmic axis with plain numbers, if there is anything on it."""
     if not np.isfinite(axis.get_minpos()):
         return

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -110,7 +110,7 @@ class Results:
         scenario = self.scenario
         return {
             "scenario": scenario.name,
-            "overrides": {k: _plain(v) for k, v in scenario.overrides.items()},
+            "overrides": {k: plain(v) for k, v in scenario.overrides.items()},
             "seed": self.seed,
             "runs": self.runs,
             "steps": scenario.horizon,
@@ -145,7 +145,7 @@ class Results:
             "ratio_to_bound": rmse / bound if bound > 0 else None,
             "diagnostics": self._diagnostics(agent) | own,
         }
-        return {key: _plain(value) for key, value in figures.items()}
+        return {key: plain(value) for key, value in figures.items()}
 
     def _diagnostics(self, agent: str) -> dict[str, float]:
         one, scored, dim = self.agents[agent], self.scored, self.scenario.arena.dim
@@ -177,12 +177,12 @@ def _number(value: float) -> float | int | None:
     return value if math.isfinite(value) else None
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value as JSON knows it."""
     if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
+        return {key: plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [plain(each) for each in value]
     return value if value is None or isinstance(value, str | bool) else _number(value)
 
 
@@ -195,9 +195,9 @@ def rows(results: Results, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     bound, lines = results.bound, []
     if bound is not None:
         known = {"rmse": bound.rmse, "rmse_after_10s": bound.rmse_after(10.0)}
-        lines.append(["bound", *(_short(_plain(known.get(key))) for key in keys)])
+        lines.append(["bound", *(short(plain(known.get(key))) for key in keys)])
     for name, figures in results.summary["agents"].items():
-        lines.append([name, *(_short(figures[key]) for key in keys)])
+        lines.append([name, *(short(figures[key]) for key in keys)])
     return lines
 
 
@@ -210,12 +210,12 @@ def markdown(results: Results) -> str:
     if results.scenario.overrides:
         chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
-    text += _table(["agent", *COLUMNS.values()], rows(results))
+    text += table(["agent", *COLUMNS.values()], rows(results))
     text += ["", _EXPLAINED.format(results.lost_beyond, metrics.LOST_SECONDS, dim)]
     if len(names) > 1 and results.runs > 1:
         differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
-        text += _table(["agent", "mean difference", "95 % interval"], differences)
+        text += table(["agent", "mean difference", "95 % interval"], differences)
     for name, one in results.agents.items():
         if one.raised:
             how_many = f"{one.raised} of {results.runs} runs"
@@ -262,19 +262,21 @@ def write(results: Results, folder: Path, figures: bool = True) -> None:
 
 def _interval(results: Results, a: str, b: str) -> list[str]:
     difference = results.paired_difference(a, b)
-    return [_signed(difference.mean), f"{_signed(difference.low)} to {_signed(difference.high)}"]
+    return [signed(difference.mean), f"{signed(difference.low)} to {signed(difference.high)}"]
 
 
-def _table(header: list[str], lines: list[list[str]]) -> list[str]:
-    every = [header, ["---", *["---:"] * (len(header) - 1)], *lines]
+def table(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1) -> list[str]:
+    """The lines of a Markdown table; all columns but the first ``left`` are set right."""
+    every = [header, [*["---"] * left, *["---:"] * (len(header) - left)], *lines]
     return ["| " + " | ".join(cells) + " |" for cells in every]
 
 
-def _signed(value: float) -> str:
+def signed(value: float) -> str:
+    """Two digits and a sign."""
     return f"{value:+.2g}".replace("-", "−")
 
 
-def _short(value: float | None) -> str:
+def short(value: float | None) -> str:
     """Three digits, no exponent where it can be helped."""
     if value is None:
         return "–"

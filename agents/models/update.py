@@ -1,30 +1,38 @@
 """Gaussian measurement updates in information form: what every EKF here is made of."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from agents.models.measurements import Block
-from agents.models.process import Process
-from agents.models.robust import Weights
+from agents.robust.screen import Prediction, Screen, Trust
 
-Weigh = Callable[[Sequence[Block], Weights | None], Weights]
 Linearize = Callable[[Float[Tensor, "B N S"]], Sequence[Block]]
 
 
+@dataclass(frozen=True)
+class Update:
+    """A posterior, the trust that its measurements got, and what the screen remembers."""
+
+    state: Float[Tensor, "B N S"]
+    covariance: Float[Tensor, "B N E E"]
+    trusts: list[Trust]
+    memory: Float[Tensor, "B N K"]
+
+
 def information(
-    blocks: Sequence[Block], weights: Weights
+    blocks: Sequence[Block], trusts: Sequence[Trust]
 ) -> tuple[Float[Tensor, "B N E E"], Float[Tensor, "B N E"]]:
     """Λ = Σ w Hᵀ R⁻¹ H and η = Σ w Hᵀ R⁻¹ r over all measurements of all blocks."""
     rows, scaled, residuals = [], [], []
-    for block, weight in zip(blocks, weights, strict=True):
-        w = (weight * block.mask).unsqueeze(-1) / block.total_variance
+    for block, trust in zip(blocks, trusts, strict=True):
         h = block.jacobian.flatten(-3, -2)
         rows.append(h)
-        scaled.append(h * w.flatten(-2).unsqueeze(-1))
-        residuals.append(block.residual.flatten(-2))
+        scaled.append(h * trust.information(block).flatten(-2).unsqueeze(-1))
+        residuals.append(trust.residual(block).flatten(-2))
     h, wh = torch.cat(rows, -2), torch.cat(scaled, -2)
     r = torch.cat(residuals, -1)
     return h.mT @ wh, (wh.mT @ r.unsqueeze(-1))[..., 0]
@@ -43,24 +51,29 @@ def posterior(
 
 
 def iterated_update(
-    process: Process,
-    x: Float[Tensor, "B N S"],
-    covariance: Float[Tensor, "B N E E"],
-    linearize: Linearize,
-    weigh: Weigh,
-    iterations: int,
-) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-    """Iterated (Gauss-Newton) EKF update of a prior (x, P).
+    prior: Prediction, linearize: Linearize, screen: Screen, iterations: int
+) -> Update:
+    """Iterated (Gauss-Newton) EKF update of a prior, its measurements trusted as a screen says.
 
-    ``weigh`` gives each iteration's weights from its blocks and the last iteration's weights.
+    Where the prior is broad, the screen's extra iterations come first.
     """
-    state, updated, weights, delta = x, covariance, None, covariance[..., 0]
-    for iteration in range(iterations):
+    process, x, covariance = screen.process, prior.state, prior.covariance
+    state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
+    evidence, trusts, extra = None, [], 0
+    if screen.extra:
+        broad = prior.broad(process.dim).unsqueeze(-1)
+        extra = screen.extra if bool(broad.any()) else 0
+    for iteration in range(-extra, iterations):
         blocks = linearize(state)
-        weights = weigh(blocks, weights)
-        precision, vector = information(blocks, weights)
-        if iteration:  # residuals are about state = x ⊞ δ: refer them to the prior
+        if iteration == -extra:
+            evidence = screen.judge(blocks, prior)
+        trusts = screen.weigh(blocks, evidence, iteration == iterations - 1)
+        precision, vector = information(blocks, trusts)
+        if iteration > -extra:  # residuals are about state = x ⊞ δ: refer them to the prior
             vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
         delta, updated = posterior(covariance, precision, vector)
         state = process.boxplus(x, delta)
-    return state, updated
+        if iteration < 0:  # what is not broad has not begun
+            delta, state = torch.where(broad, delta, 0.0), torch.where(broad, state, x)
+    memory = screen.remember(prior, evidence, lambda: linearize(state))
+    return Update(state, updated, trusts, memory)

@@ -1,9 +1,10 @@
 """Weighted particles: their moments on the manifold, systematic resampling, regularization."""
 
 import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from agents.models.process import Process
@@ -11,7 +12,13 @@ from agents.models.process import Process
 
 def effective_sample_size(log_weights: Float[Tensor, "*s M"]) -> Float[Tensor, "*s"]:
     """1 / Σ w² of the normalized weights."""
-    return torch.exp(-torch.logsumexp(2 * log_weights.log_softmax(-1), -1))
+    squared = torch.logsumexp(2 * log_weights.double().log_softmax(-1), -1)
+    return torch.exp(-squared).to(log_weights.dtype)
+
+
+def normalized(log_weights: Float32[Tensor, "*s M"]) -> Float32[Tensor, "*s M"]:
+    """Log-weights whose weights sum to 1."""
+    return log_weights.double().log_softmax(-1).to(log_weights.dtype)
 
 
 def select(x: Float[Tensor, "B N M k"], index: Int64[Tensor, "B N m"]) -> Float[Tensor, "B N m k"]:
@@ -20,36 +27,52 @@ def select(x: Float[Tensor, "B N M k"], index: Int64[Tensor, "B N m"]) -> Float[
     return first.gather(-1, index.expand(len(first), *index.shape)).movedim(0, -1)
 
 
+@dataclass(frozen=True)
+class Moments:
+    """A weighted cloud's mean and error covariance, and what they were made from: every particle's
+    error ``apart`` from a heavy one, and ``shift``, the mean's."""
+
+    mean: Float32[Tensor, "B N S"]
+    covariance: Float64[Tensor, "B N E E"]
+    apart: Float32[Tensor, "B N M E"]
+    shift: Float32[Tensor, "B N E"]
+
+
 def moments(
     process: Process, particles: Float32[Tensor, "B N M S"], weights: Float32[Tensor, "B N M"]
-) -> tuple[Float32[Tensor, "B N S"], Float32[Tensor, "B N M E"]]:
-    """Weighted mean, and every particle's error from it; a heavy particle anchors the mean of
-    attitudes, whose tangents are averaged about it."""
+) -> Moments:
+    """Weighted mean and covariance; a heavy particle anchors the mean of attitudes, whose tangents
+    are averaged about it.
+
+    Sums over particles are float64 here and below: how many dead particles (of weight 0) a batch
+    drags along must not show.
+    """
     anchor = select(particles, weights.argmax(-1, keepdim=True))
     apart = process.boxminus(particles, anchor)
-    shift = (weights.unsqueeze(-2) @ apart)[..., 0, :]
-    mean = process.boxplus(anchor[..., 0, :], shift)
-    return mean, apart - shift.unsqueeze(-2)
-
-
-def weighted_covariance(
-    apart: Float32[Tensor, "B N M E"], weights: Float32[Tensor, "B N M"]
-) -> Float32[Tensor, "B N E E"]:
-    """Σ w δ δᵀ of errors about the mean."""
-    return apart.mT @ (apart * weights.unsqueeze(-1))
+    exact = apart.double()
+    scaled = exact * weights.unsqueeze(-1)
+    first = scaled.sum(-2)
+    covariance = exact.mT @ scaled - first.unsqueeze(-1) * first.unsqueeze(-2)
+    shift = first.to(apart.dtype)
+    return Moments(process.boxplus(anchor[..., 0, :], shift), covariance, apart, shift)
 
 
 def systematic(
-    weights: Float32[Tensor, "B N M"], offset: Float32[Tensor, "B N"]
+    weights: Float32[Tensor, "B N M"],
+    offset: Float32[Tensor, "B N"],
+    count: Int64[Tensor, "B N"] | None = None,
 ) -> Int64[Tensor, "B N M"]:
-    """Systematic resampling (Kitagawa 1996): ancestors of M equally weighted particles.
+    """Systematic resampling (Kitagawa 1996): ancestors of ``count`` equally weighted particles (M
+    where None); what stands in later slots is nothing to rely on.
 
-    Rung i stands at (i + offset) / M; its ancestor's number is that of the particles whose
+    Rung i stands at (i + offset) / count; its ancestor's number is that of the particles whose
     cumulative weight lies below, so counting where those fall replaces M searches.
     """
     m = weights.shape[-1]
+    rungs = torch.full_like(offset, m) if count is None else count
     cumulative = weights.double().cumsum(-1)
-    height = cumulative * (m / cumulative[..., -1:]) - offset.double().unsqueeze(-1)
+    height = cumulative * (rungs.unsqueeze(-1) / cumulative[..., -1:])
+    height = height - offset.double().unsqueeze(-1)
     # The first rung above each particle; a UAV whose weights are NaN gets some ancestors, too.
     first = (height.floor() + 1).nan_to_num_().clamp_(0, m).to(torch.int64)
     passed = torch.zeros(*weights.shape[:-1], m + 1, dtype=torch.int64, device=weights.device)
@@ -59,17 +82,17 @@ def systematic(
 
 def liu_west(
     process: Process,
-    mean: Float32[Tensor, "B N S"],
-    apart: Float32[Tensor, "B N M E"],
-    covariance: Float32[Tensor, "B N E E"],
+    cloud: Moments,
+    ancestors: Int64[Tensor, "B N M"],
     noise: Float32[Tensor, "B N M E"],
     shrink: float,
-    floor: Float32[Tensor, "E"],
+    floor: Float64[Tensor, "E"],
 ) -> Float32[Tensor, "B N M S"]:
-    """Regularization x ← μ ⊞ (√(1−h²) (x ⊟ μ) + N(0, h² Σ + floor)) (Liu & West 2001), which
-    keeps the cloud's mean and, floor aside, its covariance. ``shrink`` is h."""
-    factor = torch.linalg.cholesky_ex(
-        (shrink**2 * covariance + torch.diag(floor**2)).double()
-    ).L.to(noise.dtype)
+    """Regularization x ← μ ⊞ (√(1−h²) (x ⊟ μ) + N(0, h² Σ + floor)) (Liu & West 2001) of each
+    particle's ancestor, which keeps the cloud's mean and, floor aside, its covariance. ``shrink``
+    is h."""
+    spread = shrink**2 * cloud.covariance + torch.diag(floor**2)
+    factor = torch.linalg.cholesky_ex(spread).L.to(noise.dtype)
+    apart = select(cloud.apart, ancestors) - cloud.shift.unsqueeze(-2)
     moved = math.sqrt(1 - shrink**2) * apart + (factor @ noise.mT).mT
-    return process.boxplus(mean.unsqueeze(-2), moved)
+    return process.boxplus(cloud.mean.unsqueeze(-2), moved)

@@ -14,6 +14,7 @@ from agents.models.measurements import (
     UavRanges,
 )
 from agents.models.process import Process
+from agents.robust import Trust
 from coloc_env.observation import Observation
 
 
@@ -23,23 +24,26 @@ def landmark_log_likelihood(
     particles: Float32[Tensor, "B N M S"],
     centre: Float32[Tensor, "B N S"],
     observation: Observation,
+    trust: Trust,
 ) -> Float32[Tensor, "B N M"]:
-    """−Σ‖z − Rᵀ(L − p)‖² / 2σ² over landmarks, from sums over landmarks made once per UAV:
+    """−Σ w‖z − Rᵀ(L − p)‖² / 2σ² over landmarks, from sums over landmarks made once per UAV:
 
-    Σ‖z − Rᵀ(L − p)‖² = n‖p‖² − 2 p·(ΣL − R Σz) − 2 tr(R Σ z Lᵀ) + const,
+    Σ w‖z − Rᵀ(L − p)‖² = Σw ‖p‖² − 2 p·(ΣwL − R Σwz) − 2 tr(R Σ w z Lᵀ) + const,
 
     so a particle costs O(1). Exact; p and L are taken about the centre's position and R about the
     centre's rotation (R = R̄ + ΔR), which keeps float32 from cancelling.
     """
     d = process.dim
-    visible = observation["landmark_mask"].unsqueeze(-1)
-    z = observation["landmarks"].unflatten(-1, (-1, d)) * visible
+    weight = observation["landmark_mask"]
+    if trust.weight is not None:
+        weight = weight * trust.weight.to(weight.dtype)
+    weight = weight.unsqueeze(-1)
+    z = observation["landmarks"].unflatten(-1, (-1, d)) * weight
     points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
-    points = points * visible
     at = process.rotation(centre)
     if at is None:
         raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
-    count, sum_z = visible.sum((-2, -1)), z.sum(-2)
+    count, sum_z = weight.sum((-2, -1)), z.sum(-2)
     p = particles[..., :d] - centre[..., None, :d]
     rotation = process.rotation(particles)
     assert rotation is not None
@@ -50,22 +54,28 @@ def landmark_log_likelihood(
         by_row[..., row, :, row] = sum_z
     by_row[..., d] = points.mT @ z
     turned = (by_row.flatten(-3, -2).mT @ turn.mT).mT
-    fixed = points.sum(-2) - (at @ sum_z.unsqueeze(-1))[..., 0]
+    fixed = (points * weight).sum(-2) - (at @ sum_z.unsqueeze(-1))[..., 0]
     along = p * (count[..., None, None] * p + 2 * (turned[..., :d] - fixed.unsqueeze(-2)))
     return (sum(along.unbind(-1)) - 2 * turned[..., d]) * (-0.5 / model.std**2)
 
 
 def range_log_likelihood(
-    block: Block, ranges: Float32[Tensor, "B N S"], particles: Tensor, points: Tensor
+    block: Block,
+    ranges: Float32[Tensor, "B N S"],
+    particles: Float32[Tensor, "B N M d"],
+    points: Float32[Tensor, "B N S d"],
+    trust: Trust,
 ) -> Float32[Tensor, "B N M"]:
-    """−Σ (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre."""
+    """−Σ w (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre."""
     squared: Tensor | None = None
     for own, theirs in zip(particles.unbind(-1), points.unbind(-1), strict=True):
         apart = own.unsqueeze(-2) - theirs.unsqueeze(-1)  # [B, N, S, M]
         squared = apart.mul_(apart) if squared is None else squared.addcmul_(apart, apart)
     assert squared is not None
+    if trust.shift is not None:
+        ranges = ranges - trust.shift.to(ranges.dtype)
     residual = squared.sqrt_().sub_(ranges.unsqueeze(-1))
-    weight = block.mask / block.total_variance[..., 0]
+    weight = trust.information(block)[..., 0].to(ranges.dtype)
     return (weight.unsqueeze(-2) @ residual.square_())[..., 0, :] * -0.5
 
 
@@ -76,9 +86,10 @@ def log_likelihood(
     centre: Float32[Tensor, "B N S"],
     observation: Observation,
     neighbours: Neighbours,
+    trusts: Sequence[Trust],
 ) -> Float32[Tensor, "B N M"]:
-    """Sum over all sensors' measurements; what a neighbour's uncertainty adds to a range's variance
-    is taken at the centre."""
+    """Sum over all sensors' measurements, each trusted as ``trusts`` says; what a neighbour's
+    uncertainty adds to a range's variance is taken at the centre."""
     total = torch.zeros_like(particles[..., 0])
     d = process.dim
     wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
@@ -88,20 +99,33 @@ def log_likelihood(
     spread = Neighbours(
         near.position.unsqueeze(2), near.variance.unsqueeze(2), near.known.unsqueeze(2)
     )
-    for model in models:
+    for model, trust in zip(models, trusts, strict=True):
         if isinstance(model, LandmarkVectors):
-            total = total + landmark_log_likelihood(model, process, particles, centre, observation)
+            total = total + landmark_log_likelihood(
+                model, process, particles, centre, observation, trust
+            )
             continue
         if isinstance(model, UavRanges) and not model.tags:
             block = model.linearize(process, centre, observation, near, derivatives=False)
             total = total + range_log_likelihood(
-                block, observation["ranges"], particles[..., :d], near.position
+                block, observation["ranges"], particles[..., :d], near.position, trust
             )
             continue
         block = model.linearize(process, particles, wide, spread, derivatives=False)
+        trust = _per_particle(trust, total.dtype)
         variance = block.total_variance
-        squared = block.residual**2 / variance
+        squared = trust.residual(block) ** 2 / variance
         if block.partner_variance is not None:
             squared = squared + variance.log()
+        if trust.weight is not None:
+            squared = squared * trust.weight.unsqueeze(-1)
         total = total - 0.5 * squared.sum(-1).masked_fill(~block.mask, 0.0).sum(-1)
     return total
+
+
+def _per_particle(trust: Trust, dtype: torch.dtype) -> Trust:
+    """The same for every particle."""
+    weight, shift = (
+        None if x is None else x.to(dtype).unsqueeze(2) for x in (trust.weight, trust.shift)
+    )
+    return Trust(weight, shift)

@@ -16,11 +16,11 @@ def increment(
     log_weights: Float32[Tensor, "B N M"],
     log_likelihood: Float32[Tensor, "B N M"],
     left: Float32[Tensor, "B N"],
-    target: float,
+    goal: Float32[Tensor, "B N"],
 ) -> Float32[Tensor, "B N"]:
     """The largest share β ≤ ``left`` of the log-likelihood that keeps the effective sample size at
-    ``target`` · M, by bisection of log β (adaptive tempering, Del Moral, Doucet & Jasra 2012)."""
-    goal = target * log_weights.shape[-1]
+    ``goal`` particles, by bisection of log β (adaptive tempering, Del Moral, Doucet & Jasra 2012).
+    """
 
     def enough(beta: Tensor) -> Tensor:
         return effective_sample_size(log_weights + beta.unsqueeze(-1) * log_likelihood) >= goal

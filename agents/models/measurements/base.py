@@ -66,9 +66,15 @@ class Block:
 
 
 class Measurement(ABC):
-    """A sensor's model. ``cooperative`` ones involve other UAVs."""
+    """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` says which of its
+    measurements are there (None: a single one, always)."""
 
     cooperative = False
+    mask_leaf: str | None = None
+
+    def count(self, observation: Observation) -> int:
+        """How many measurements its block has."""
+        return 1 if self.mask_leaf is None else observation[self.mask_leaf].shape[-1]
 
     @abstractmethod
     def linearize(

@@ -37,6 +37,8 @@ def _range_bearing(
 class LandmarkRangeBearings(Measurement):
     """Range and bearing to landmarks at known positions."""
 
+    mask_leaf = "landmark_bearing_mask"
+
     def __init__(self, sensor: LandmarkBearings) -> None:
         self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth
 
@@ -64,6 +66,7 @@ class UavRangeBearings(Measurement):
     """Range and bearing to neighbours, whose position is known as well as ``neighbours`` says."""
 
     cooperative = True
+    mask_leaf = "uav_bearing_mask"
 
     def __init__(self, sensor: UavBearings) -> None:
         self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth

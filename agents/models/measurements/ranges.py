@@ -79,6 +79,8 @@ class _Ranges(Measurement):
 class AnchorRanges(_Ranges):
     """Distances to anchors at known positions."""
 
+    mask_leaf = "anchor_range_mask"
+
     def __init__(self, sensor: AnchorRanging) -> None:
         super().__init__(sensor.noise.std, sensor.tags)
         self.n_tags = sensor.n_tags
@@ -105,6 +107,7 @@ class UavRanges(_Ranges):
     """
 
     cooperative = True
+    mask_leaf = "range_mask"
 
     def __init__(self, sensor: Ranging) -> None:
         super().__init__(sensor.noise.std, sensor.tags)

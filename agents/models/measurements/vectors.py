@@ -14,6 +14,8 @@ from coloc_env.sensors import Height, Landmarks, SlowFlight
 class LandmarkVectors(Measurement):
     """z = Rᵀ(L − p) + noise for known landmarks."""
 
+    mask_leaf = "landmark_mask"
+
     def __init__(self, sensor: Landmarks) -> None:
         self.std = sensor.std
 
@@ -53,6 +55,8 @@ class LandmarkVectors(Measurement):
 
 class Heights(Measurement):
     """z of the position."""
+
+    mask_leaf = "height_mask"
 
     def __init__(self, sensor: Height) -> None:
         self.variance = sensor.std**2

@@ -1,0 +1,50 @@
+"""Mahalanobis distances in closed form, and the χ² quantiles that they are held against."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+from jaxtyping import Float
+from scipy.stats import chi2
+from torch import Tensor
+
+from agents.models.measurements import Block
+
+
+@lru_cache
+def chi_square(probability: float, dof: int) -> float:
+    """Quantile of the χ² distribution."""
+    return float(chi2.ppf(probability, dof))
+
+
+def whitened_squares(
+    residual: Sequence[Float[Tensor, "*#s"]], covariance: Sequence[Sequence[Float[Tensor, "*#s"]]]
+) -> list[Float[Tensor, "*s"]]:
+    """Terms of rᵀ S⁻¹ r, by elimination (S = L D Lᵀ): term j is that of component j given those
+    before it, so that the sum of the last k is the squared distance under S's conditional.
+
+    Components apart: for the few that a measurement has, hundreds of solves become some twenty
+    products, and no number depends on how many others are computed beside it.
+    """
+    r, terms = list(residual), []
+    s = [list(row) for row in covariance]
+    for j in range(len(r)):
+        terms.append(r[j] ** 2 / s[j][j])
+        for i in range(j + 1, len(r)):
+            factor = s[i][j] / s[j][j]
+            r[i] = r[i] - factor * r[j]
+            for c in range(j + 1, i + 1):
+                s[i][c] = s[i][c] - factor * s[c][j]
+    return terms
+
+
+def mahalanobis_squared(
+    block: Block, covariance: Float[Tensor, "B N E E"]
+) -> Float[Tensor, "B N m"]:
+    """rᵀ (H P Hᵀ + R)⁻¹ r of each measurement's innovation under the prior covariance P."""
+    h, r = block.jacobian, block.residual.unbind(-1)
+    spread = h @ covariance.unsqueeze(-3)
+    s = [[(spread[..., i, :] * h[..., j, :]).sum(-1) for j in range(i + 1)] for i in range(len(r))]
+    for i, noise in enumerate(block.total_variance.unbind(-1)):
+        s[i][i] = s[i][i] + noise
+    terms = whitened_squares(r, s)
+    return sum(terms[1:], terms[0])

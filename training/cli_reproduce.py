@@ -1,0 +1,83 @@
+"""``coloc reproduce``: a paper's experiments, its numbers beside ours."""
+
+import os
+import shutil
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Paper(StrEnum):
+    """Papers that can be reproduced."""
+
+    pfnn = "pfnn"
+
+
+class Part(StrEnum):
+    """What of a paper's report."""
+
+    paper = "paper"
+    robustness = "robustness"
+    all = "all"
+
+
+def reproduce(
+    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report and store.")],
+    part: Annotated[
+        Part, typer.Option(help="The paper's own tables and figures, the study beyond, or both.")
+    ] = Part.all,
+    runs: Annotated[int, typer.Option(help="Worlds; figure 9 takes half as many more.")] = 20,
+    seed: Annotated[int, typer.Option(help="Seed of the first world.")] = 0,
+    agents: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,C", help="These agents only; others' figures stay empty."),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Cut runs to so many steps: for a quick look.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes at once, of one thread each.")] = 1,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Throw the store away first.")] = False,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="DIR", help="Folder of recordings (sets COLOC_DATA)."),
+    ] = None,
+) -> None:
+    """Run a paper's experiments, and write its tables and figures with its numbers beside ours.
+
+    What is done is kept in DIR/store at once: the same command, or one for another part, goes on
+    where the last one stopped. Other settings, other code and other weights make other entries, so
+    nothing is ever mixed. DIR/report.md says what became of every claim.
+
+    **Examples**
+
+    coloc reproduce pfnn --out results/pfnn --jobs 2
+
+    coloc reproduce pfnn --out results/quick --part paper --runs 4 --steps 200
+    """
+    for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
+        if value is not None and value < 1:
+            raise ValueError(f"--{name} {value} is not allowed: at least 1")
+    if not 0 <= seed < 2**62:
+        raise ValueError(f"--seed {seed} is not allowed: a whole number from 0 to 2^62")
+    if data is not None:
+        os.environ["COLOC_DATA"] = str(data)
+    import torch
+
+    from training.cli import _progress
+    from training.evaluate import split_agents
+    from training.reproduce.pfnn.run import reproduce as run
+
+    torch.set_num_threads(1)
+    wanted = None if agents is None else split_agents(agents)
+    if fresh:
+        shutil.rmtree(out / "store", ignore_errors=True)
+    with _progress() as tell:
+        run(out, part.value, runs, seed, wanted, steps, jobs, tell, _say)
+    typer.echo(f"written to {out}/report.md")
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)

@@ -1,0 +1,142 @@
+"""What agents cost: time of every step, and memory, of the whole team in one world on one thread.
+
+All agents take each step in turn, so that whatever else the machine does slows them alike and
+their times can be compared pair by pair.
+"""
+
+import json
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from agents.localizer import Localizer, make
+from coloc_env.scenario import Scenario
+from coloc_env.world import World
+from training.evaluate import Progress
+from training.metrics import Floats
+from training.play import NUMERICAL
+from training.reproduce.store import Store
+from training.reproduce.study import Piece, Variant
+
+MEMORY = """\
+Memory, measured: *belief* is what the team carries from step to step; *working set* is the most
+that torch has allocated on top of it at any moment of the run's last step. The interpreter and
+libraries, the same for all, are left out. The paper does not say what its figure holds."""
+_WARM_UP = 5  # steps taken before those that are timed
+
+
+@dataclass(frozen=True, eq=False)
+class Cost:
+    """``ms`` [K] of each step; ``belief`` and ``working`` in bytes."""
+
+    ms: Floats
+    belief: int
+    working: int
+
+
+@torch.no_grad()
+def measure(
+    scenario: Scenario, agents: Sequence[str], seed: int, tell: Progress
+) -> dict[str, Cost]:
+    """Cost of each agent over a run; an agent that raises a numerical error has none."""
+    teams = {name: _Team(make(name, scenario), scenario, seed) for name in agents}
+    ms: dict[str, list[float]] = {name: [] for name in agents}
+    with _one_thread():
+        for k in range(_WARM_UP + scenario.horizon):
+            for name, team in list(teams.items()):
+                if k in (0, _WARM_UP):
+                    team.start()
+                try:
+                    spent = team.step()
+                except NUMERICAL:
+                    del teams[name]
+                    continue
+                if k >= _WARM_UP:
+                    ms[name].append(spent)
+            tell("cost", k + 1, _WARM_UP + scenario.horizon)
+        return {
+            name: Cost(np.array(ms[name]), team.belief.bytes(), _peak(team))
+            for name, team in teams.items()
+        }
+
+
+def measured(
+    store: Store, variant: Variant, seed: int, agents: Sequence[str], tell: Progress
+) -> dict[str, Cost]:
+    """The cost of agents, from the store if it is there."""
+    if not agents:
+        return {}
+    name = f"{variant.key}/cost-{seed}"
+    settings = {"cost": [Piece(variant, agent, seed, 1).settings() for agent in agents]}
+    if not store.has(name, settings):
+        found = measure(variant.build(), agents, seed, tell)
+        facts = {agent: [one.belief, one.working] for agent, one in found.items()}
+        store.save(name, settings, {agent: one.ms for agent, one in found.items()}, facts)
+    arrays, facts = store.load(name, settings)
+    return {agent: Cost(arrays[agent], *facts[agent]) for agent in facts}
+
+
+class _Team:
+    """A team in a world of its own."""
+
+    def __init__(self, localizer: Localizer, scenario: Scenario, seed: int) -> None:
+        self.localizer, self.seed, self.world = localizer, seed, World(scenario)
+
+    def start(self) -> None:
+        self.observation = self.world.reset(self.seed)
+        self.belief = self.localizer.reset(self.observation)
+
+    def step(self) -> float:
+        """One step on; the localizer's time in ms."""
+        start = time.perf_counter()
+        belief, estimate = self.localizer.step(self.belief, self.observation)
+        spent = time.perf_counter() - start
+        self.belief = belief
+        self.world.advance(estimate.action())
+        self.observation = self.world.observation()
+        return 1e3 * spent
+
+
+def _peak(team: _Team) -> int:
+    """Bytes allocated at the height of a step, as torch's profiler tells it."""
+    with tempfile.TemporaryDirectory() as folder, _no_chatter():
+        with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+            team.localizer.step(team.belief, team.observation)
+        trace = Path(folder) / "trace.json"
+        profiler.export_chrome_trace(str(trace))
+        events = json.loads(trace.read_text())["traceEvents"]
+    changes = [e for e in events if e.get("name") == "[memory]"]
+    changes.sort(key=lambda event: event["ts"])
+    held = np.cumsum([0, *(event["args"]["Bytes"] for event in changes)])
+    return int(held.max())
+
+
+@contextmanager
+def _no_chatter() -> Iterator[None]:
+    """The profiler writes about itself to stderr, past Python: away with that."""
+    kept = os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,111 @@
+"""What a result depends on beside its settings: the code that made it, and learned weights.
+
+The code is that of the agent, of the worlds it meets, and of everything of this project that those
+import; comments and docstrings do not count.
+"""
+
+import ast
+import hashlib
+import importlib.util
+import inspect
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from agents.localizer import LOCALIZERS, Localizer
+
+_PACKAGES = ("agents", "coloc_env", "training")
+_WORLD = ("coloc_env.world", "coloc_env.scenarios", "coloc_env.bounds", "training.play")
+
+
+def code_of(agent: str, *modules: str) -> str:
+    """Hash of the code that an agent and its worlds run, and of other modules."""
+    factory = LOCALIZERS[agent.split(":")[0]]
+    source = inspect.getsourcefile(factory)
+    first = [file for name in (*_WORLD, *modules) for file in _files(name)]
+    return _closure((*first, *([Path(source)] if source else [])))
+
+
+def weights_of(localizer: Localizer) -> str | None:
+    """Hash of a localizer's learned weights, wherever in its parts; None if it has none."""
+    digest, some = hashlib.sha256(), False
+    for module in _modules(localizer, set()):
+        for key, value in module.state_dict().items():
+            some = True
+            digest.update(f"{key}{tuple(value.shape)}".encode())
+            digest.update(value.detach().to("cpu", torch.float64).numpy().tobytes())
+    return digest.hexdigest()[:12] if some else None
+
+
+def _modules(part: Any, seen: set[int]) -> Iterator[nn.Module]:
+    """The neural parts of an object of this project, of its parts, and so on."""
+    if id(part) in seen:
+        return
+    seen.add(id(part))
+    if isinstance(part, nn.Module):
+        yield part
+        return
+    inside: Iterable[Any] = ()
+    if isinstance(part, list | tuple):
+        inside = part
+    elif isinstance(part, dict):
+        inside = part.values()
+    elif hasattr(part, "__dict__") and type(part).__module__.split(".")[0] == "agents":
+        inside = vars(part).values()
+    for each in inside:
+        yield from _modules(each, seen)
+
+
+@lru_cache
+def _closure(first: tuple[Path, ...]) -> str:
+    """Hash of files and of what they import, whatever the order."""
+    found: dict[Path, str] = {}
+    left = list(first)
+    while left:
+        path = left.pop()
+        if path not in found:
+            found[path], imports = _read(path)
+            left += imports
+    text = "\n".join(sorted(found.values()))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@lru_cache
+def _read(path: Path) -> tuple[str, tuple[Path, ...]]:
+    """A file's code without its docstrings, and the project's files that it imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    imports = tuple(file for name in _imported(tree) for file in _files(name))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                node.body = node.body[1:]
+    return ast.dump(tree), imports
+
+
+def _imported(tree: ast.AST) -> Iterator[str]:
+    """Names that may be modules: ``a.b`` and, of ``from a import b``, both ``a`` and ``a.b``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@lru_cache
+def _files(name: str) -> tuple[Path, ...]:
+    """The file of a module of this project; none for anything else. Imports nothing.
+
+    ``agents`` itself only registers all agents: to import it is to depend on none of them.
+    """
+    package, *rest = name.split(".")
+    spec = importlib.util.find_spec(package) if package in _PACKAGES and name != "agents" else None
+    if spec is None or spec.origin is None:
+        return ()
+    path = Path(spec.origin).parent.joinpath(*rest)
+    return tuple(p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file())

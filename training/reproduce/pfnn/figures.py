@@ -1,0 +1,311 @@
+"""The paper's figures 2 to 9, redrawn from our runs."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
+from scipy.ndimage import uniform_filter1d
+
+from coloc_env.render.style import INK, MUTED, rgb, uav_colours
+from coloc_env.world import World
+from training import metrics
+from training.figures import BOUND, STYLE, log_axis
+from training.metrics import Floats
+from training.reproduce.pfnn import paper
+from training.reproduce.pfnn.flown import Flown
+from training.reproduce.pfnn.plan import ablation_agents
+
+FILES = (
+    "figure_2_ablation.png",
+    "figure_3_trajectories.png",
+    "figure_4_errors.png",
+    "figure_5_rmse.png",
+    "figure_6_boxes.png",
+    "figure_7_particles.png",
+    "figure_8_ess.png",
+    "figure_9_cdf.png",
+)
+SHOWN = "pfnn"  # whose figures 3 to 8 are
+_ACROSS = 3  # panels beside each other
+_ACCENT, _CALM = rgb("#D55E00"), rgb("#8d9ab0")
+_LINES = {  # figure 9b: as the paper's lines, in colours that all eyes tell apart
+    "pfnn": {"color": "#009E73", "linestyle": "-", "linewidth": 2.4},
+    "pf500": {"color": "#D55E00", "linestyle": "--", "linewidth": 1.6},
+    "pf800": {"color": "#E69F00", "linestyle": "-.", "linewidth": 1.6},
+    "apf": {"color": "#0072B2", "linestyle": ":", "linewidth": 2.0},
+    "ekf": {"color": "#CC79A7", "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": 1.6},
+}
+
+
+def draw(flown: Flown, folder: Path) -> dict[str, str]:
+    """Write the figures that there are runs for; their captions by file name."""
+    drawings: Sequence[Callable[[Flown], Figure]] = (
+        ablation,
+        trajectories,
+        errors,
+        bars,
+        boxes,
+        particles,
+        ess,
+        cdf,
+    )
+    captions = {}
+    for name, drawing in zip(FILES, drawings, strict=True):
+        if drawing is ablation:
+            needs = set(ablation_agents())
+        else:
+            needs = set(_LINES) if drawing is cdf else {SHOWN}
+        if not needs & flown.tables.agents.keys():
+            continue
+        with mpl.rc_context(STYLE):
+            figure = drawing(flown)
+            page = Bbox.union([figure.bbox_inches, figure.get_tightbbox()])
+            figure.savefig(folder / name, dpi=150, bbox_inches=page)
+        captions[name] = " ".join((drawing.__doc__ or "").split())
+    return captions
+
+
+def ablation(flown: Flown) -> Figure:
+    """Figure 2: ablation of the correction's range; dots: mean over runs, bars: 95 % interval."""
+    spans = {a: s for a, s in ablation_agents().items() if a in flown.tables.agents}
+    figure, panels = _panels(
+        3, 3.6, f"Ablation of the correction's range · {flown.tables.runs} runs", sharey=True
+    )
+    row = paper.TABLE_4["pfnn"]
+    assert row.particles is not None
+    columns: tuple[tuple[str, Callable[[str], Floats | None], float], ...] = (
+        ("RMSE (m)", flown.rmse, row.rmse.mean),
+        ("largest error (m)", flown.largest, row.max.mean),
+        ("average particles", flown.particles, row.particles.mean),
+    )
+    for axes, (label, of, theirs) in zip(panels, columns, strict=True):
+        for i, agent in enumerate(spans):
+            values = of(agent)
+            if values is None:
+                continue
+            found = metrics.paired_difference(values, np.zeros_like(values))
+            colour = _ACCENT if spans[agent] == paper.PROPOSED else MUTED
+            if np.isfinite(found.low):
+                axes.plot([found.low, found.high], [i, i], color=colour, linewidth=2.5)
+            axes.plot(found.mean, i, "o", color=colour)
+        axes.set(xlabel=label)
+        axes.set_title(f"paper, [0.4, 1.0]: {theirs:g}", fontsize=9, fontweight="normal")
+        axes.margins(x=0.15)
+        axes.locator_params(axis="x", nbins=4)
+    panels[0].set_yticks(range(len(spans)), [f"[{a}, {b}]" for a, b in spans.values()])
+    panels[0].set_ylim(len(spans) - 0.5, -0.5)
+    return figure
+
+
+def trajectories(flown: Flown) -> Figure:
+    """Figure 3: trajectories of the first run; coloured: true, dashed: estimated, squares:
+    landmarks."""
+    results = flown.tables
+    figure = Figure(figsize=(9.5, 5.6))
+    FigureCanvasAgg(figure)
+    axes: Any = figure.add_subplot(projection="3d")
+    estimate = results.truth[0] + results.agents[SHOWN].offset[0]
+    for i, colour in enumerate(_uavs(flown)):
+        axes.plot(*results.truth[0, :, i].T, color=colour, linewidth=1.0, label=_name(i))
+        axes.plot(*estimate[:, i].T, "--", color=INK, linewidth=0.8)
+    leaves = World(results.scenario, window=1).reset(results.seed).leaves
+    if "landmark_map" in leaves:
+        places = leaves["landmark_map"][0, 0].unflatten(-1, (-1, 3))
+        axes.plot(*places.T.numpy(), "s", color="black", markersize=4, label="landmark")
+    low, high = results.scenario.arena.low, results.scenario.arena.high
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    axes.locator_params(axis="y", nbins=4)
+    axes.set_box_aspect((3.0, 2.0, 1.0), zoom=1.15)
+    axes.view_init(elev=32, azim=-60)
+    lines, _ = axes.get_legend_handles_labels()
+    dashed = Line2D([], [], color=INK, linestyle="--", linewidth=0.8, label="estimate")
+    figure.legend(handles=[*lines, dashed], loc="center right")
+    figure.subplots_adjust(left=0.0, right=0.82, bottom=0.0, top=0.98)
+    _title(figure, f"Trajectories · PF-NN, seed {results.seed}")
+    return figure
+
+
+def errors(flown: Flown) -> Figure:
+    """Figure 4: position error over time; bold: root mean square over runs, thin: run 1, dashed:
+    bound."""
+    results = flown.tables
+    error = results.agents[SHOWN].error
+    squares = np.sqrt(np.nanmean(np.where(results.scored, error, np.nan) ** 2, 0))
+    figure, panels = _over_time(flown, "Position error over time", "error (m)", error[0], squares)
+    for i, axes in enumerate(panels):
+        if results.bound is not None:
+            axes.plot(_time(flown), results.bound.position[:, i].numpy(), **BOUND)
+        log_axis(axes.yaxis, axes.set_yscale)
+    return figure
+
+
+def bars(flown: Flown) -> Figure:
+    """Figure 5: RMSE of each UAV, the paper's above ours (mean over runs; whiskers: standard
+    deviation)."""
+    figure, (axes,) = _panels(1, 3.8, f"RMSE of each UAV · PF-NN, {flown.tables.runs} runs")
+    tracks = metrics.rmse_per_track(flown.error(SHOWN), flown.tables.scored)
+    ours, apart = tracks.mean(0), tracks.std(0)
+    theirs = [row.rmse for name, row in paper.TABLE_3.items() if name != "Average"]
+    at = np.arange(len(ours))
+    few = min(len(theirs), len(ours))
+    axes.barh(at[:few] - 0.2, theirs[:few], 0.38, color=_CALM)
+    axes.barh(at + 0.2, ours, 0.38, color=_uavs(flown), xerr=apart, error_kw={"ecolor": INK})
+    for y, value in zip(at[:few] - 0.2, theirs, strict=False):
+        axes.text(value, y, f" paper {value:.3f}", va="center", fontsize=8, color=MUTED)
+    for y, value, spread in zip(at + 0.2, ours, apart, strict=True):
+        axes.text(value + spread, y, f"  ours {value:.3f}", va="center", fontsize=8)
+    axes.set_yticks(at, [_name(i) for i in range(len(at))])
+    axes.set(xlabel="RMSE (m)", ylim=(len(ours) - 0.5, -0.5))
+    axes.margins(x=0.12)
+    axes.grid(False, axis="y")
+    return figure
+
+
+def boxes(flown: Flown) -> Figure:
+    """Figure 6: position errors of each UAV, all steps and runs; box: quartiles, whiskers: 5 % to
+    95 %, cross: the largest."""
+    figure, (axes,) = _panels(1, 3.8, f"Position errors · PF-NN, {flown.tables.runs} runs")
+    results = flown.tables
+    error = results.agents[SHOWN].error
+    for i, colour in enumerate(_uavs(flown)):
+        values, line = error[:, :, i][results.scored[:, :, i]], {"color": colour}
+        axes.boxplot(
+            [values],
+            positions=[i],
+            orientation="horizontal",
+            widths=0.55,
+            whis=(5, 95),
+            showfliers=False,
+            patch_artist=True,
+            boxprops={"facecolor": (*colour, 0.2), "edgecolor": colour},
+            medianprops=line | {"linewidth": 2},
+            whiskerprops=line,
+            capprops=line,
+        )
+        axes.plot(values.max(), i, "x", color=colour)
+    axes.axvline(paper.MEDIAN, color=MUTED, linestyle=":", linewidth=1.3)
+    axes.text(paper.MEDIAN, -0.62, " paper: medians below", fontsize=8, color=MUTED, va="top")
+    axes.set_yticks(range(error.shape[2]), [_name(i) for i in range(error.shape[2])])
+    axes.set(xlabel="position error (m)", ylim=(error.shape[2] - 0.5, -0.7))
+    log_axis(axes.xaxis, axes.set_xscale)
+    axes.grid(False, axis="y")
+    return figure
+
+
+def particles(flown: Flown) -> Figure:
+    """Figure 7: particles over time; bold: mean over runs, thin: run 1, dotted: the 800 at which
+    the paper's saturate."""
+    count = flown.tables.agents[SHOWN].series["particles"]
+    mean = np.nanmean(count, 0)
+    figure, panels = _over_time(flown, "Particles over time", "particles", count[0], mean)
+    for axes in panels:
+        axes.axhline(paper.MAX_PARTICLES, color=MUTED, linestyle=":", linewidth=1.3)
+        axes.set_ylim(0, 1.1 * paper.MAX_PARTICLES)
+    return figure
+
+
+def ess(flown: Flown) -> Figure:
+    """Figure 8: effective share of the particles before resampling; bold: mean over runs and 5 s,
+    thin: run 1, shade: the paper's 0.3 to 0.6."""
+    share = flown.tables.agents[SHOWN].series["ess_share"]
+    width = max(1, min(round(5.0 / flown.tables.dt), share.shape[1]))
+    smooth = uniform_filter1d(np.nanmean(share, 0), width, axis=0, mode="nearest")
+    title = "Effective sample size over time"
+    figure, panels = _over_time(flown, title, "ESS ÷ particles", share[0], smooth)
+    for axes in panels:
+        axes.axhspan(*paper.ESS_BAND, color=MUTED, alpha=0.15, linewidth=0, zorder=0)
+        axes.set_ylim(0, 1)
+    return figure
+
+
+def cdf(flown: Flown) -> Figure:
+    """Figure 9: distribution of the RMSE over runs; left: each UAV (dashed: its mean), right:
+    methods."""
+    results = flown.cdf
+    title = f"Distribution of the RMSE · {results.runs} runs"
+    figure, (left, right) = _panels(2, 4.4, title, sharey=True)
+    if SHOWN in results.agents:
+        tracks = metrics.rmse_per_track(results.agents[SHOWN].error, results.scored)
+        for i, colour in enumerate(_uavs(flown)):
+            _steps(left, tracks[:, i], color=colour, linewidth=1.4, label=_name(i))
+            left.axvline(tracks[:, i].mean(), color=colour, linestyle="--", linewidth=0.8)
+        left.legend(loc="lower right")
+    for agent, look in _LINES.items():
+        if agent in results.agents:
+            values = metrics.rmse_per_run(results.agents[agent].error, results.scored)
+            _steps(right, values, label=paper.METHODS[agent], **look)
+    if results.bound is not None:
+        right.axvline(results.bound.rmse, label="posterior bound", **BOUND)
+    right.legend(loc="lower right")
+    left.set(ylabel="share of runs below (%)", ylim=(0, 101))
+    for axes, part in ((left, "PF-NN, each UAV"), (right, "methods, whole team")):
+        axes.set(xlabel="RMSE of a run (m)")
+        axes.set_title(part, fontsize=9.5)
+    return figure
+
+
+# ------------------------------------------------------------------ parts
+
+
+def _panels(
+    count: int, height: float, title: str, sharey: bool = False
+) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(7.5 if count == 1 else 9.5, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    _title(figure, title)
+    return figure, list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
+
+
+def _title(figure: Figure, title: str) -> None:
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+def _over_time(
+    flown: Flown, title: str, label: str, thin: Floats, bold: Floats
+) -> tuple[Figure, list[Axes]]:
+    """A panel for each UAV with two lines [K, N]."""
+    colours = _uavs(flown)
+    rows = -(-len(colours) // _ACROSS)
+    figure = Figure(figsize=(9.5, 1.0 + 1.9 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    _title(figure, f"{title} · PF-NN, {flown.tables.runs} runs")
+    grid = figure.subplots(rows, _ACROSS, squeeze=False, sharex=True, sharey=True)
+    panels, time = list(grid.flat), _time(flown)
+    for axes in panels[len(colours) :]:
+        axes.set_visible(False)
+    for i, (axes, colour) in enumerate(zip(panels, colours, strict=False)):
+        axes.plot(time, thin[:, i], color=colour, linewidth=0.5, alpha=0.5)
+        axes.plot(time, bold[:, i], color=colour, linewidth=1.5)
+        axes.set_title(_name(i), fontsize=9.5)
+        axes.set_xlim(0.0, max(float(time[-1]), 1e-3))
+    for axes in grid[-1]:
+        axes.set_xlabel("time (s)")
+    for axes in grid[:, 0]:
+        axes.set_ylabel(label)
+    return figure, panels[: len(colours)]
+
+
+def _steps(axes: Axes, values: Floats, **look: Any) -> None:
+    kept = np.sort(values[np.isfinite(values)])
+    share = 100 * np.arange(1, len(kept) + 1) / len(kept)
+    axes.step(np.concatenate((kept[:1], kept)), np.concatenate(([0], share)), where="post", **look)
+
+
+def _uavs(flown: Flown) -> list[tuple[float, float, float]]:
+    return [(r, g, b) for r, g, b in uav_colours(flown.tables.scenario.arena.n_uavs).tolist()]
+
+
+def _name(i: int) -> str:
+    return f"UAV-{i + 1}"
+
+
+def _time(flown: Flown) -> Floats:
+    return np.arange(flown.tables.scenario.horizon) * flown.tables.dt

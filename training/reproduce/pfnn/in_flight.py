@@ -1,0 +1,37 @@
+"""The paper's own experiment: the corrector learns from the truth while it flies."""
+
+from dataclasses import dataclass, replace
+
+from training.evaluate import Progress
+from training.metrics import Floats
+from training.pfnn_online import learn_in_flight
+from training.reproduce.identity import code_of
+from training.reproduce.store import Store
+from training.reproduce.study import Piece, Variant
+
+NAME = "pfnn, learning in flight"
+
+
+@dataclass(frozen=True, eq=False)
+class InFlight:
+    """``error`` (m) and ``count`` of particles [R, K, N], ``loss`` [R, L] before each training."""
+
+    error: Floats
+    count: Floats
+    loss: Floats
+
+
+def learned(store: Store, variant: Variant, seed: int, runs: int, tell: Progress) -> InFlight:
+    """All runs, from the store if they are there."""
+    piece = Piece(variant, "pfnn", seed, runs)
+    name = replace(piece, agent="pfnn-in-flight").name
+    settings = piece.settings() | {
+        "weights": "learned in flight",
+        "code": code_of("pfnn", "training.pfnn_online"),
+    }
+    if not store.has(name, settings):
+        flown = learn_in_flight(variant.build(), runs, seed, tell)
+        arrays = {key: getattr(flown, key).numpy() for key in ("error", "count", "loss")}
+        store.save(name, settings, arrays, {})
+    arrays, _ = store.load(name, settings)
+    return InFlight(**arrays)

@@ -1,0 +1,202 @@
+"""Agents in variants of scenarios: what is to be flown, and the results put together again.
+
+A piece of work is one agent in one variant over a block of seeds, or (agent ``WORLD``) the worlds
+themselves with their bound. More runs of the same are another block, so that tables over 20 runs
+and a figure over 30 share what they can; and whatever was computed for one table serves all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+
+from agents.localizer import make
+from coloc_env.bounds import Bound
+from coloc_env.scenario import Scenario
+from coloc_env.scenarios import make_scenario
+from training.evaluate import Progress, evaluate
+from training.reproduce.identity import code_of, weights_of
+from training.reproduce.store import Arrays, Store
+from training.results import AgentResult, Results
+
+WORLD = "dead_reckoning"  # flown with the bound, for the worlds' truth: it applies to all of them
+_SERIES = "series."
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A scenario with some overrides, known by ``key``; at most ``steps`` long."""
+
+    key: str
+    title: str
+    overrides: tuple[tuple[str, Any], ...] = ()
+    scenario: str = "indoor-v0"
+    steps: int | None = None
+
+    def build(self) -> Scenario:
+        """ValueError or OSError where it cannot be (recordings that are not there)."""
+        return _built(self)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One agent in the worlds of ``runs`` seeds from ``seed`` on."""
+
+    variant: Variant
+    agent: str
+    seed: int
+    runs: int
+
+    @property
+    def name(self) -> str:
+        agent = self.agent.replace("/", "_")  # options may hold paths
+        return f"{self.variant.key}/{agent}-{self.seed}+{self.runs}"
+
+    @property
+    def size(self) -> int:
+        """Steps of all runs."""
+        return self.runs * self.variant.build().horizon
+
+    def settings(self) -> dict[str, Any]:
+        """All that the result depends on. ValueError if the agent cannot serve the scenario."""
+        return _settings(self)
+
+
+@lru_cache(maxsize=8)
+def _built(variant: Variant) -> Scenario:
+    built = make_scenario(variant.scenario, **dict(variant.overrides))
+    steps = built.horizon if variant.steps is None else min(variant.steps, built.horizon)
+    return replace(built, horizon=steps)
+
+
+@cache
+def _settings(piece: Piece) -> dict[str, Any]:
+    scenario = piece.variant.build()
+    return {
+        "scenario": scenario.name,
+        "overrides": dict(piece.variant.overrides),
+        "steps": scenario.horizon,
+        "seed": piece.seed,
+        "runs": piece.runs,
+        "agent": piece.agent,
+        "weights": weights_of(make(piece.agent, scenario)),
+        "code": code_of(piece.agent),
+        "torch": str(torch.__version__),
+    }
+
+
+def compute(piece: Piece, store: Store, progress: Progress | None = None) -> None:
+    """Fly a piece and store what came of it."""
+    settings = piece.settings()
+    scenario, of_world = piece.variant.build(), piece.agent == WORLD
+    found = evaluate(scenario, [piece.agent], piece.runs, piece.seed, progress, bound=of_world)
+    one = found.agents[piece.agent]
+    arrays: Arrays = {"offset": one.offset, "nees": one.nees, "broken": one.broken}
+    arrays |= {_SERIES + key: values for key, values in one.series.items()}
+    if of_world:
+        arrays |= {"truth": found.truth, "attitude": found.attitude, "scored": found.scored}
+        if found.bound is not None:
+            arrays["bound_mse"] = found.bound.mse.numpy()
+            arrays["bound_scored"] = found.bound.scored.numpy()
+    facts = {
+        "raised": one.raised,
+        "message": one.message,
+        "ms_per_step": one.ms_per_step,
+        "start": found.truth[:, 0].tolist(),
+    }
+    store.save(piece.name, settings, arrays, facts)
+
+
+class Study:
+    """What a store holds of agents in variants over the same seeds."""
+
+    def __init__(self, store: Store, seed: int) -> None:
+        self.store, self.seed = store, seed
+        self.failed: dict[tuple[str, str], str] = {}  # (variant's key, agent): why
+
+    def pieces(self, variant: Variant, agent: str, *blocks: int) -> list[Piece]:
+        """Blocks of so many runs each, one after the other."""
+        starts = np.cumsum((0, *blocks[:-1])).tolist()
+        return [
+            Piece(variant, agent, self.seed + start, runs)
+            for start, runs in zip(starts, blocks, strict=True)
+        ]
+
+    def missing(self, pieces: Sequence[Piece]) -> list[Piece]:
+        """Those not computed yet, once each. Where the scenario cannot be built, or the agent does
+        not serve it, that is noted in ``failed``."""
+        left = []
+        for piece in dict.fromkeys(pieces):
+            try:
+                if not self.store.has(piece.name, piece.settings()):
+                    left.append(piece)
+            except (ValueError, OSError) as error:
+                self.failed[piece.variant.key, piece.agent] = str(error)
+        return left
+
+    def can(self, variant: Variant) -> bool:
+        """Whether the variant's worlds are there."""
+        return (variant.key, WORLD) not in self.failed
+
+    def results(self, variant: Variant, agents: Sequence[str], *blocks: int) -> Results:
+        """All agents that did not fail, over all blocks' runs."""
+        scenario = variant.build()
+        worlds = [self._load(piece) for piece in self.pieces(variant, WORLD, *blocks)]
+        first = worlds[0][0]
+        bound = None
+        if "bound_mse" in first:
+            mse, scored = (
+                torch.from_numpy(_joined(worlds, f"bound_{key}")) for key in ("mse", "scored")
+            )
+            bound = Bound(mse, scored, scenario.arena.dt)
+        starts = [facts["start"] for _, facts in worlds]
+        found = {}
+        for agent in agents:
+            if (variant.key, agent) in self.failed:
+                continue
+            flown = [self._load(piece) for piece in self.pieces(variant, agent, *blocks)]
+            if [facts["start"] for _, facts in flown] != starts:
+                raise ValueError(f"{variant.key}: {agent} met other worlds than the bound")
+            found[agent] = _agent_result(flown)
+        return Results(
+            scenario=scenario,
+            seed=self.seed,
+            truth=_joined(worlds, "truth"),
+            attitude=first["attitude"],
+            scored=_joined(worlds, "scored"),
+            bound=bound,
+            agents=found,
+        )
+
+    def _load(self, piece: Piece) -> tuple[Arrays, dict[str, Any]]:
+        return self.store.load(piece.name, piece.settings())
+
+
+Loaded = Sequence[tuple[Arrays, dict[str, Any]]]
+
+
+def _agent_result(blocks: Loaded) -> AgentResult:
+    """An agent's blocks of runs as one; errors are the lengths of the offsets."""
+    offset = _joined(blocks, "offset")
+    first, facts = blocks[0]
+    return AgentResult(
+        offset=offset,
+        error=np.linalg.norm(offset.astype(np.float64), axis=-1).astype(np.float32),
+        nees=_joined(blocks, "nees"),
+        broken=_joined(blocks, "broken"),
+        raised=sum(each["raised"] for _, each in blocks),
+        message=next((each["message"] for _, each in blocks if each["message"]), None),
+        series={
+            key.removeprefix(_SERIES): _joined(blocks, key)
+            for key in first
+            if key.startswith(_SERIES) and all(key in arrays for arrays, _ in blocks)
+        },
+        ms_per_step=facts["ms_per_step"],
+    )
+
+
+def _joined(blocks: Loaded, key: str) -> np.ndarray:
+    return np.concatenate([arrays[key] for arrays, _ in blocks])
