@@ -19,7 +19,7 @@ from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
-from agents.models.update import iterated_update
+from agents.models.update import Update, iterated_update
 from agents.particles import population
 from agents.particles.cloud import (
     Moments,
@@ -47,9 +47,8 @@ _FLOOR = {"position": 0.005, "velocity": 0.005, "attitude": 0.0015, "accel": 0.0
 _FIXED = {"position": 0.03, "velocity": 0.03, "attitude": 0.01, "accel": 0.01, "gyro": 0.001}
 _RESAMPLE = 0.5  # share of the count below which the effective sample size triggers resampling
 _START_STEPS = 3  # steps in which the likelihood is tempered down to that share
-_RESCUE = 0.1  # the share below which it is tempered later
-_STAGES = 5  # of a likelihood at most; what is left then is used at once
-_START_STAGES = 40  # in the first steps: more than any likelihood has needed
+_RESCUE = 0.1  # the share below which particles are drawn anew later
+_STAGES = 40  # more than any likelihood has needed
 _WIDEN = 1.1  # of the guided proposal's covariance
 _ITERATIONS = 3  # of the update that screens measurements and guides proposals
 
@@ -81,6 +80,14 @@ class _Step:
     key: Int64[Tensor, "B N"]
 
 
+@dataclass(frozen=True)
+class _Guide:
+    """A Gaussian prior at a predicted cloud's moments, and its update by the measurements."""
+
+    prior: Prediction
+    found: Update
+
+
 def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
     """One random key per UAV, from what its prior says and the localizer's seed: the same UAV in
     the same world draws the same numbers in any batch, team subset or face."""
@@ -102,9 +109,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
     """Bootstrap filter; its number of particles is fixed unless ``bounds`` let it adapt.
 
     ``perturb``: ``liu_west`` moves resampled particles so that the cloud keeps its moments, above a
-    small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). ``tempering=false`` uses
-    every likelihood at once, however few particles survive it. ``proposal=ekf`` draws from 1.1 ×
-    an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003).
+    small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). A likelihood that leaves
+    few particles is used in stages in the first steps; later, particles are drawn anew from 1.1 ×
+    an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003) if
+    enough survive those; ``proposal=ekf`` does so at every step.
+    ``tempering=false`` uses every likelihood as it comes.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
     ``compile=true`` compiles the step's two large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.
@@ -190,12 +199,15 @@ class ParticleFilter(Localizer[ParticleBelief]):
         memory = belief.memory
         if self.models and (self.screens or self.proposal == "ekf"):
             particles = self.process.propagate(particles, u, dt, draws[..., :w])
-            particles, log_weights, trusts, memory = self._guide(particles, log_weights, now)
-            now = replace(now, trusts=trusts)
+            guide = self._guide(particles, log_weights, now)
+            now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
+            if self.proposal == "ekf":
+                particles, log_weights = self._drawn(guide, now, slots)
             gain = self._evidence(particles, log_weights, now)
         else:
+            guide = None
             particles, gain = self._foresee(particles, log_weights, u, dt, draws[..., :w], now)
-        particles, log_weights = self._weigh(particles, log_weights, gain, now)
+        particles, log_weights = self._weigh(particles, log_weights, gain, guide, now)
         cloud, ess, target, few, moved = self._conclude(
             particles, log_weights, belief.count, draws[..., w:], key
         )
@@ -269,14 +281,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         now: _Step,
-    ) -> tuple[
-        Float32[Tensor, "B N M S"],
-        Float32[Tensor, "B N M"],
-        Sequence[Trust],
-        Float[Tensor, "B N K"],
-    ]:
-        """A Gaussian update at the moments of the predicted cloud: how far to trust what was
-        measured and, with ``proposal="ekf"``, where to draw particles anew."""
+    ) -> _Guide:
+        """A Gaussian update at the moments of the predicted cloud."""
         cloud = moments(self.process, particles, log_weights.exp())
         covariance = cloud.covariance + torch.diag(self.floor.to(cloud.covariance.device) ** 2)
         prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
@@ -286,43 +292,75 @@ class ParticleFilter(Localizer[ParticleBelief]):
                 m.linearize(self.process, at, now.observation, now.neighbours) for m in self.models
             ]
 
-        found = iterated_update(prior, linearize, self.screen, _ITERATIONS)
-        if self.proposal == "prior":
-            return particles, log_weights, found.trusts, found.memory
-        slots = particles.shape[-2]
+        return _Guide(prior, iterated_update(prior, linearize, self.screen, _ITERATIONS))
+
+    def _drawn(
+        self, guide: _Guide, now: _Step, slots: int
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """Particles from 1.1 × the guide's posterior, with the log-weights that make them stand for
+        its prior: log N(x; prior) − log N(x; drawn from)."""
         draws = _normal(now.key, "pf.propose", self.process.error_size, slots)
-        root = torch.linalg.cholesky_ex(_WIDEN * found.covariance).L
+        root = torch.linalg.cholesky_ex(_WIDEN * guide.found.covariance).L
         delta = (root.to(draws.dtype) @ draws.mT).mT
-        particles = self.process.boxplus(found.state.to(draws.dtype).unsqueeze(-2), delta)
-        away = self.process.boxminus(particles, cloud.mean.unsqueeze(-2)).double()
-        scaled = torch.linalg.solve_triangular(
-            torch.linalg.cholesky_ex(covariance).L, away.mT, upper=False
-        )
+        centre = guide.found.state.to(draws.dtype).unsqueeze(-2)
+        particles = self.process.boxplus(centre, delta)
+        mean = guide.prior.state.to(draws.dtype).unsqueeze(-2)
+        away = self.process.boxminus(particles, mean).double()
+        root = torch.linalg.cholesky_ex(guide.prior.covariance).L
+        scaled = torch.linalg.solve_triangular(root, away.mT, upper=False)
         ratio = 0.5 * (draws.square().sum(-1) - scaled.square().sum(-2))
         live = population.alive(now.belief.count, slots)
-        log_weights = torch.where(live, ratio, -torch.inf).log_softmax(-1).to(draws.dtype)
-        return particles, log_weights, found.trusts, found.memory
+        return particles, normalized(torch.where(live, ratio, -torch.inf).to(draws.dtype))
 
     def _weigh(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         gain: Float32[Tensor, "B N M"],
+        guide: _Guide | None,
         now: _Step,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Use the evidence; where it would leave too few particles, in stages with a resampling
-        move after each. A UAV that needs no stages is not touched by others that do."""
+        """Use the evidence. Where it would leave too few particles: in the first steps in stages
+        with a resampling move after each, later on particles drawn anew under a Gaussian guide. A
+        UAV that needs neither is not touched by others that do."""
+        start = now.belief.step < _START_STEPS
+        threshold = torch.where(start, _RESAMPLE, _RESCUE) * now.belief.count
+        short = effective_sample_size(log_weights + gain) < threshold
+        late = short if self.screens else short & ~start
+        early = short & ~late
+        if self.tempering and self.models and bool(late.any()):
+            guide = guide or self._guide(particles, log_weights, now)
+            drawn, ratio = self._drawn(guide, now, particles.shape[-2])
+            particles = torch.where(late[..., None, None], drawn, particles)
+            log_weights = torch.where(late.unsqueeze(-1), ratio, log_weights)
+            again = self._evidence(particles, log_weights, now)
+            gain = torch.where(late.unsqueeze(-1), again, gain)
+            # Evidence that even they cannot follow is left to the guide: its posterior, as drawn.
+            lost = (late & (effective_sample_size(log_weights + gain) < threshold)).unsqueeze(-1)
+            equal = population.equal_log_weights(log_weights > -torch.inf)
+            log_weights = torch.where(lost, equal, log_weights)
+            gain = gain.masked_fill(lost, 0.0)
+        if self.tempering and bool(early.any()):
+            return self._tempered(particles, log_weights, gain, early, now)
+        return particles, normalized(log_weights + gain)
+
+    def _tempered(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        gain: Float32[Tensor, "B N M"],
+        staged: Bool[Tensor, "B N"],
+        now: _Step,
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """The evidence in stages for some UAVs, at once for the others."""
         count = now.belief.count
-        threshold = torch.where(now.belief.step < _START_STEPS, _RESAMPLE, _RESCUE) * count
-        staged = effective_sample_size(log_weights + gain) < threshold
-        if not (self.tempering and bool(staged.any())):
-            return particles, normalized(log_weights + gain)
         equal = population.equal_log_weights(population.alive(count, particles.shape[-2]))
         left = torch.ones_like(gain[..., 0])
-        stages = torch.where(now.belief.step < _START_STEPS, _START_STAGES, _STAGES)
-        for stage in range(_START_STAGES):
-            some = increment(log_weights, gain, left, _RESAMPLE * count)
-            share = torch.where(staged & (stage + 1 < stages), some, left)
+        for stage in range(_STAGES):
+            share = left
+            if stage < _STAGES - 1:
+                some = increment(log_weights, gain, left, _RESAMPLE * count)
+                share = torch.where(staged, some, left)
             used = normalized(log_weights + share.unsqueeze(-1) * gain)
             log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
             left = left - share

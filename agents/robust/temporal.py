@@ -57,7 +57,7 @@ class TemporalConsistency:
                 residual, variance = part.unbind(-3)
                 seen = (variance[..., 0] > 0) & _still(block, frame[..., size:], prediction)
                 h = block.jacobian
-                drift = lag**2 * ((h @ moved.unsqueeze(-3)) * h).sum(-1)
+                drift = lag**2 * ((h @ moved.unsqueeze(-3)) * h).sum(-1)  # F² − I ≈ 2 (F − I)
                 spread = block.total_variance + variance + drift
                 distance = ((block.residual - residual) ** 2 / spread).sum(-1)
                 known[i] = known[i] | seen
