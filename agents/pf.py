@@ -158,6 +158,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
             self._conclude = torch.compile(self._conclude, dynamic=False)  # type: ignore[method-assign]
 
+    @property
+    def exchanges(self) -> bool:
+        return self.screen.exchanges
+
     def reset(self, observation: Observation) -> ParticleBelief:
         prior = observation["prior"]
         mean, covariance = self.process.initial(prior)

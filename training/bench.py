@@ -26,6 +26,7 @@ from agents import LOCALIZERS, make
 from coloc_env.scenarios import make_scenario
 from training.bench_cases import Case, Timed, cases
 from training.bench_figures import FIGURES, draw
+from training.bench_parts import PROFILED, step_parts
 from training.bench_peers import peers
 from training.evaluate import ms_per_step
 from training.staging import staged_folder
@@ -73,7 +74,8 @@ def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:
 
     ``environments``: per case the best and the median round in agent-steps per second, and the best
     round's ms per step; ``ratios`` to peers where they are installed; ``memory_mb``: how much the
-    process grows for 1024 worlds; ``agents``, ``particles``, ``teams``: a team's step in ms.
+    process grows for 1024 worlds; ``agents``, ``particles``, ``teams``: a team's step in ms;
+    ``parts``: where it goes, in ms by part.
     """
     with _one_thread():
         chosen = [*cases(), *peers()]
@@ -119,6 +121,10 @@ def show(results: dict[str, Any]) -> None:
         lines = [(name, _ms(ms)) for name, ms in results.get(key, {}).items()]
         if lines:
             console.print(_table((title, "ms a team's step"), lines), highlight=False)
+    for name, parts in results.get("parts", {}).items():
+        total = sum(parts.values())
+        shares = [(part, _ms(ms), f"{ms / total:.0%}") for part, ms in parts.items()]
+        console.print(_table((name, "ms", "share"), shares), highlight=False)
 
 
 # ------------------------------------------------------------------ parts
@@ -161,7 +167,7 @@ def _seconds(case: Case, timed: Timed) -> float:
     return (time.perf_counter() - start) / steps
 
 
-def _localizers(quick: bool) -> dict[str, dict[str, float | None]]:
+def _localizers(quick: bool) -> dict[str, Any]:
     """A team's step in ms: every localizer, and a particle filter by particles and team size."""
     tasks: list[tuple[str, str, str, int]] = [("agents", name, name, 6) for name in LOCALIZERS]
     if "pf800" in LOCALIZERS:
@@ -172,7 +178,10 @@ def _localizers(quick: bool) -> dict[str, dict[str, float | None]]:
     for group, key, agent, n in _track(chosen, "agents"):
         scenario = make_scenario("indoor-v0", n_uavs=n)
         found[group][key] = ms_per_step(make(agent, scenario), scenario, 0)
-    return found
+    scenario = make_scenario("indoor-v0")
+    profiled = PROFILED[:1] if quick else PROFILED
+    parts = {name: step_parts(make(name, scenario), scenario) for name in profiled}
+    return found | {"parts": parts}
 
 
 def _track(items: Sequence[T], what: str) -> Iterable[T]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from coloc_env.render.style import MUTED, uav_colours
 from training.figures import STYLE
 
-FIGURES = ("environments.png", "scaling.png", "agents.png")
+FIGURES = ("environments.png", "scaling.png", "agents.png", "parts.png")
 _PEERS = ("mpe2", "VMAS")
 
 
@@ -22,6 +22,7 @@ def draw(results: dict[str, Any], folder: Path) -> None:
         environments,
         scaling,
         agents,
+        parts,
     )
     for name, drawing in zip(FIGURES, drawings, strict=True):
         with mpl.rc_context(STYLE):
@@ -86,6 +87,29 @@ def agents(results: dict[str, Any]) -> Figure | None:
         points = {int(k): ms for k, ms in results[key].items() if ms is not None}
         axes.plot(list(points), list(points.values()), "o-", color=colour)
         axes.set(xlabel=label, ylabel="ms a step", ylim=(0, None))
+    return figure
+
+
+def parts(results: dict[str, Any]) -> Figure | None:
+    """Where the time of a team's step goes."""
+    found: dict[str, dict[str, float]] = results.get("parts", {})
+    if not found:
+        return None
+    figure, (axes,) = _figure(1, 1.2 + 0.5 * len(found), "Where a team's step goes, one world")
+    every = list(dict.fromkeys(part for one in found.values() for part in one))
+    names = list(reversed(found))
+    left = [0.0] * len(names)
+    colours = mpl.colormaps["tab20"].colors  # more parts than a palette safe for all has colours
+    for part, colour in zip(every, colours, strict=False):
+        widths = [found[name].get(part, 0.0) for name in names]
+        bars = axes.barh(names, widths, left=left, color=colour, label=part)
+        shares = [w / sum(found[n].values()) for n, w in zip(names, widths, strict=True)]
+        texts = [f"{share:.0%}" if share >= 0.05 else "" for share in shares]
+        axes.bar_label(bars, texts, label_type="center", fontsize=7)
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    axes.set(xlabel="ms a step")
+    axes.grid(axis="y", visible=False)
+    axes.legend(ncols=4, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.3), frameon=False)
     return figure
 
 

@@ -64,8 +64,8 @@ def train(
     torch.set_num_threads(threads)
     from coloc_env.options import parse
     from training import pfnn as _pfnn  # noqa: F401  (registers its training)
-    from training import trust as _trust  # noqa: F401
     from training import runs
+    from training import trust as _trust  # noqa: F401
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer it makes
     if resume is not None:
