@@ -12,25 +12,30 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
-from tensordict import TensorClass
 from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, heard, make_measurements
-from agents.models.process import Process, make_process
+from agents.models.process import make_process
 from agents.models.update import Update, iterated_update
 from agents.particles import population
+from agents.particles.belief import ParticleBelief, normal, own_keys
 from agents.particles.cloud import (
-    Moments,
     effective_sample_size,
-    liu_west,
     moments,
     normalized,
     select,
-    systematic,
 )
 from agents.particles.likelihood import log_likelihood
+from agents.particles.renewal import (
+    FLOOR,
+    RESAMPLE,
+    Perturb,
+    Renewal,
+    padded,
+    padded_weights,
+)
 from agents.particles.tempering import increment
 from agents.robust import Prediction, RobustScreen, Screen, Trust
 from coloc_env import noise
@@ -38,35 +43,13 @@ from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-Perturb = Literal["liu_west", "fixed"]
 Proposal = Literal["prior", "ekf"]
 
-# Standard deviations that keep a resampled cloud from collapsing (specs: Liu-West's floor, and the
-# smallest fixed perturbation that loses no UAV): m, m/s, rad, m/s², rad/s.
-_FLOOR = {"position": 0.005, "velocity": 0.005, "attitude": 0.0015, "accel": 0.002, "gyro": 0.0002}
-_FIXED = {"position": 0.03, "velocity": 0.03, "attitude": 0.01, "accel": 0.01, "gyro": 0.001}
-_RESAMPLE = 0.5  # share of the count below which the effective sample size triggers resampling
 _START_STEPS = 3  # steps in which the likelihood is tempered down to that share
 _RESCUE = 0.1  # the share below which particles are drawn anew later
 _STAGES = 40  # more than any likelihood has needed
 _WIDEN = 1.1  # of the guided proposal's covariance
 _ITERATIONS = 3  # of the update that screens measurements and guides proposals
-
-
-class ParticleBelief(TensorClass):
-    """Particles (float32) with normalized log-weights (−∞ for slots beyond ``count``), the UAV's
-    own random key, steps taken, the last effective sample size as a share of its count, position
-    and velocity of the last estimate (of the prior before), and what the screen remembers; batch
-    (B, N)."""
-
-    particles: Float32[Tensor, "B N M S"]
-    log_weights: Float32[Tensor, "B N M"]
-    count: Int64[Tensor, "B N"]
-    key: Int64[Tensor, "B N"]
-    step: Int64[Tensor, "B N"]
-    ess_share: Float32[Tensor, "B N"]
-    last: Float32[Tensor, "B N 2*d"]
-    memory: Float[Tensor, "B N K"]
 
 
 @dataclass(frozen=True)
@@ -86,23 +69,6 @@ class _Guide:
 
     prior: Prediction
     found: Update
-
-
-def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
-    """One random key per UAV, from what its prior says and the localizer's seed: the same UAV in
-    the same world draws the same numbers in any batch, team subset or face."""
-    bits = observation["prior"].contiguous().view(torch.int32).to(torch.int64)
-    index = torch.arange(bits.shape[-1], device=bits.device)
-    return noise.fold(noise.fold(bits, index).sum(-1), seed)
-
-
-def _normal(
-    key: Int64[Tensor, "B N"], stream: str, components: int, slots: int
-) -> Float32[Tensor, "B N M E"]:
-    """Standard normal numbers for each slot, whatever the number of slots beside it; in the memory
-    order of ``geometry.join``."""
-    which = torch.arange(components, device=key.device).view(-1, 1, 1)
-    return noise.normal(noise.fold(key, which), stream, slots).movedim(0, -1)
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -151,12 +117,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
         self.screens = robust != "none"
-        self.shrink, std = (0.7, _FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
-        self.floor = torch.tensor(_per_error(self.process, std), dtype=torch.float64)
+        self.renewal = Renewal(self.process, perturb, bounds)
         self.compiled = compile
         if compile:
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
-            self._conclude = torch.compile(self._conclude, dynamic=False)  # type: ignore[method-assign]
+            self.renewal.conclude = torch.compile(self.renewal.conclude, dynamic=False)  # type: ignore[method-assign]
 
     @property
     def exchanges(self) -> bool:
@@ -167,13 +132,13 @@ class ParticleFilter(Localizer[ParticleBelief]):
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
         m, d = self.capacity, self.process.dim
-        draws = _normal(key, "pf.reset", self.process.error_size, m)
+        draws = normal(key, "pf.reset", self.process.error_size, m)
         delta = draws * covariance.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)
         particles = self.process.boxplus(mean.unsqueeze(-2).expand(-1, -1, m, -1), delta)
         if self.believed.prior.kind == "uniform":
             arena = self.believed.arena
             low, high = (prior.new_tensor(x) for x in (arena.low, arena.high))
-            place = (_normal(key, "pf.place", d, m) * 0.5**0.5).erf() * 0.5 + 0.5
+            place = (normal(key, "pf.place", d, m) * 0.5**0.5).erf() * 0.5 + 0.5
             particles = concat((low + place * (high - low), particles[..., d:]))
         count = torch.full_like(key, self.particles)
         live = population.alive(count, m)
@@ -194,7 +159,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[ParticleBelief, Estimate]:
         key = noise.fold(belief.key, belief.step)
         slots, w = self._slots(belief.count), self.process.noise_size
-        draws = _normal(key, "pf.step", w + self.process.error_size, slots)
+        draws = normal(key, "pf.step", w + self.process.error_size, slots)
         u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
         neighbours = heard(self.believed, observation)
@@ -208,29 +173,33 @@ class ParticleFilter(Localizer[ParticleBelief]):
             if self.proposal == "ekf":
                 particles, log_weights = self._drawn(guide, now, slots)
             gain = self._evidence(particles, log_weights, now)
+            short = self._short(log_weights + gain, now)
         else:
             guide = None
-            particles, gain = self._foresee(particles, log_weights, u, dt, draws[..., :w], now)
-        particles, log_weights = self._weigh(particles, log_weights, gain, guide, now)
-        cloud, ess, target, few, moved = self._conclude(
+            particles, gain, short = self._foresee(
+                particles, log_weights, u, dt, draws[..., :w], now
+            )
+        if self.tempering and self.models and bool(short.any()):
+            particles, log_weights = self._rescued(particles, log_weights, gain, short, guide, now)
+        else:
+            log_weights = log_weights + gain
+        particles, log_weights, cloud, ess, target = self.renewal.conclude(
             particles, log_weights, belief.count, draws[..., w:], key
         )
+        particles, log_weights = self.renewal.shrunk(
+            particles, log_weights, cloud, belief.count, target
+        )
         d = self.process.dim
-        least = torch.eye(d, dtype=torch.float64, device=key.device) * _FLOOR["position"] ** 2
+        least = torch.eye(d, dtype=torch.float64, device=key.device) * FLOOR["position"] ** 2
         estimate = Estimate(
             position=cloud.mean[..., :d],
             velocity=cloud.mean[..., d : 2 * d],
             covariance=cloud.covariance[..., :d, :d] + least,
             batch_size=key.shape,
         )
-        particles, log_weights = self._renewed(
-            particles, log_weights, belief.count, target, few, moved, cloud.mean
-        )
         after = ParticleBelief(
-            particles=self._padded(particles, cloud.mean),
-            log_weights=torch.nn.functional.pad(
-                log_weights, (0, self.capacity - slots), value=-torch.inf
-            ),
+            particles=padded(particles, cloud.mean, self.capacity),
+            log_weights=padded_weights(log_weights, self.capacity),
             count=target,
             key=belief.key,
             step=belief.step + 1,
@@ -257,16 +226,6 @@ class ParticleFilter(Localizer[ParticleBelief]):
             return self.capacity
         return min(self.capacity, int(count.max()) + population.GROW)
 
-    def _padded(
-        self, particles: Float32[Tensor, "B N m S"], mean: Float32[Tensor, "B N S"]
-    ) -> Float32[Tensor, "B N M S"]:
-        """With the slots that the step left out, which hold the mean as dead particles do."""
-        missing = self.capacity - particles.shape[-2]
-        if not missing:
-            return particles
-        rest = mean.unsqueeze(-2).expand(*mean.shape[:-1], missing, mean.shape[-1])
-        return torch.cat((particles.movedim(-1, 0), rest.movedim(-1, 0)), -1).movedim(0, -1)
-
     def _foresee(
         self,
         particles: Float32[Tensor, "B N M S"],
@@ -275,10 +234,17 @@ class ParticleFilter(Localizer[ParticleBelief]):
         dt: Float32[Tensor, "B N 1"],
         draws: Float32[Tensor, "B N M W"],
         now: _Step,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Each particle moves with its own draw of the motion's noise, and meets the evidence."""
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
+        """Each particle moves with its own draw of the motion's noise, and meets the evidence;
+        whether that leaves too few."""
         particles = self.process.propagate(particles, u, dt, draws)
-        return particles, self._evidence(particles, log_weights, now)
+        gain = self._evidence(particles, log_weights, now)
+        return particles, gain, self._short(log_weights + gain, now)
+
+    def _short(self, log_weights: Float32[Tensor, "B N M"], now: _Step) -> Bool[Tensor, "B N"]:
+        """Whether weights are those of too few particles."""
+        share = torch.where(now.belief.step < _START_STEPS, RESAMPLE, _RESCUE)
+        return effective_sample_size(log_weights) < share * now.belief.count
 
     def _guide(
         self,
@@ -288,7 +254,9 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> _Guide:
         """A Gaussian update at the moments of the predicted cloud."""
         cloud = moments(self.process, particles, log_weights.exp())
-        covariance = cloud.covariance + torch.diag(self.floor.to(cloud.covariance.device) ** 2)
+        covariance = cloud.covariance + torch.diag(
+            self.renewal.floor.to(cloud.covariance.device) ** 2
+        )
         prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
 
         def linearize(at: Tensor) -> Sequence[Block]:
@@ -303,7 +271,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
         """Particles from 1.1 × the guide's posterior, with the log-weights that make them stand for
         its prior: log N(x; prior) − log N(x; drawn from)."""
-        draws = _normal(now.key, "pf.propose", self.process.error_size, slots)
+        draws = normal(now.key, "pf.propose", self.process.error_size, slots)
         root = torch.linalg.cholesky_ex(_WIDEN * guide.found.covariance).L
         delta = (root.to(draws.dtype) @ draws.mT).mT
         centre = guide.found.state.to(draws.dtype).unsqueeze(-2)
@@ -316,23 +284,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         live = population.alive(now.belief.count, slots)
         return particles, normalized(torch.where(live, ratio, -torch.inf).to(draws.dtype))
 
-    def _weigh(
+    def _rescued(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         gain: Float32[Tensor, "B N M"],
+        short: Bool[Tensor, "B N"],
         guide: _Guide | None,
         now: _Step,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Use the evidence. Where it would leave too few particles: in the first steps in stages
-        with a resampling move after each, later on particles drawn anew under a Gaussian guide. A
-        UAV that needs neither is not touched by others that do."""
-        start = now.belief.step < _START_STEPS
-        threshold = torch.where(start, _RESAMPLE, _RESCUE) * now.belief.count
-        short = effective_sample_size(log_weights + gain) < threshold
-        late = short if self.screens else short & ~start
+        """Particles and unnormalized log-weights where the evidence would leave too few: in the
+        first steps used in stages with a resampling move after each; later, or where a screen has a
+        guide at hand, on particles drawn anew. A UAV that needs neither is not touched."""
+        late = short if self.screens else short & (now.belief.step >= _START_STEPS)
         early = short & ~late
-        if self.tempering and self.models and bool(late.any()):
+        if bool(late.any()):
             guide = guide or self._guide(particles, log_weights, now)
             drawn, ratio = self._drawn(guide, now, particles.shape[-2])
             particles = torch.where(late[..., None, None], drawn, particles)
@@ -340,13 +306,13 @@ class ParticleFilter(Localizer[ParticleBelief]):
             again = self._evidence(particles, log_weights, now)
             gain = torch.where(late.unsqueeze(-1), again, gain)
             # Evidence that even they cannot follow is left to the guide: its posterior, as drawn.
-            lost = (late & (effective_sample_size(log_weights + gain) < threshold)).unsqueeze(-1)
+            lost = (late & self._short(log_weights + gain, now)).unsqueeze(-1)
             equal = population.equal_log_weights(log_weights > -torch.inf)
             log_weights = torch.where(lost, equal, log_weights)
             gain = gain.masked_fill(lost, 0.0)
-        if self.tempering and bool(early.any()):
+        if bool(early.any()):
             return self._tempered(particles, log_weights, gain, early, now)
-        return particles, normalized(log_weights + gain)
+        return particles, log_weights + gain
 
     def _tempered(
         self,
@@ -363,7 +329,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         for stage in range(_STAGES):
             share = left
             if stage < _STAGES - 1:
-                some = increment(log_weights, gain, left, _RESAMPLE * count)
+                some = increment(log_weights, gain, left, RESAMPLE * count)
                 share = torch.where(staged, some, left)
             used = normalized(log_weights + share.unsqueeze(-1) * gain)
             log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
@@ -373,8 +339,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
                 break
             weights = log_weights.exp()
             key = noise.fold(now.key, stage)
-            draws = _normal(key, "pf.move", self.process.error_size, weights.shape[-1])
-            moved = self._resample(
+            draws = normal(key, "pf.move", self.process.error_size, weights.shape[-1])
+            moved = self.renewal.resample(
                 moments(self.process, particles, weights), weights, count, draws, key
             )
             particles = torch.where(go_on[..., None, None], moved, particles)
@@ -401,75 +367,6 @@ class ParticleFilter(Localizer[ParticleBelief]):
         )
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
-
-    def _conclude(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        log_weights: Float32[Tensor, "B N M"],
-        count: Int64[Tensor, "B N"],
-        draws: Float32[Tensor, "B N M E"],
-        key: Int64[Tensor, "B N"],
-    ) -> tuple[
-        Moments,
-        Float32[Tensor, "B N"],
-        Int64[Tensor, "B N"],
-        Bool[Tensor, "B N"],
-        Float32[Tensor, "B N M S"],
-    ]:
-        """Algorithm 2: the cloud's moments and effective sample size, the count adapted to it, who
-        must resample, and the particles that they get."""
-        weights, ess = log_weights.exp(), effective_sample_size(log_weights)
-        cloud = moments(self.process, particles, weights)
-        target = count if self.bounds is None else population.adapted(count, ess, self.bounds)
-        few = ess < _RESAMPLE * count
-        return cloud, ess, target, few, self._resample(cloud, weights, target, draws, key)
-
-    def _renewed(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        log_weights: Float32[Tensor, "B N M"],
-        count: Int64[Tensor, "B N"],
-        target: Int64[Tensor, "B N"],
-        few: Bool[Tensor, "B N"],
-        moved: Float32[Tensor, "B N M S"],
-        mean: Float32[Tensor, "B N S"],
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Resampled particles where there were few, the heaviest where there were many."""
-        live = population.alive(target, particles.shape[-2])
-        fewer = target < count
-        if bool(fewer.any()):
-            particles, kept = population.heaviest_first(particles, log_weights, fewer)
-            kept = normalized(kept.masked_fill(~live, -torch.inf))
-            log_weights = torch.where(fewer.unsqueeze(-1), kept, log_weights)
-        particles = torch.where(few[..., None, None], moved, particles)
-        equal = population.equal_log_weights(live)
-        log_weights = torch.where(few.unsqueeze(-1), equal, log_weights)
-        if self.bounds is not None:
-            particles = torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2))
-        return particles, log_weights
-
-    def _resample(
-        self,
-        cloud: Moments,
-        weights: Float32[Tensor, "B N M"],
-        count: Int64[Tensor, "B N"],
-        draws: Float32[Tensor, "B N M E"],
-        key: Int64[Tensor, "B N"],
-    ) -> Float32[Tensor, "B N M S"]:
-        """Equally weighted particles drawn from the weighted ones, then moved apart."""
-        ancestors = systematic(weights, noise.unit(key), count)
-        floor = self.floor.to(draws.device)
-        return liu_west(self.process, cloud, ancestors, draws, self.shrink, floor)
-
-
-def _per_error(process: Process, std: dict[str, float]) -> list[float]:
-    """A standard deviation for each component of the process's error."""
-    d, turn = process.dim, process.attitude_error
-    if turn is None:
-        return [std["position"]] * d + [std["velocity"]] * d
-    linear = [std["position"]] * d + [std["velocity"]] * (turn.start - d)
-    biases = [std["accel"]] * 3 + [std["gyro"]] * 3
-    return (linear + [std["attitude"]] * (turn.stop - turn.start) + biases)[: process.error_size]
 
 
 @register("pf500")

@@ -9,7 +9,8 @@ from torch import Tensor
 from agents.checkpoint import load
 from agents.corrector import WeightCorrector, motion_features
 from agents.localizer import register
-from agents.pf import AdaptiveParticleFilter, ParticleBelief
+from agents.particles.belief import ParticleBelief
+from agents.pf import AdaptiveParticleFilter
 from coloc_env.scenario import Believed
 
 

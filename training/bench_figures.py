@@ -99,7 +99,9 @@ def parts(results: dict[str, Any]) -> Figure | None:
     every = list(dict.fromkeys(part for one in found.values() for part in one))
     names = list(reversed(found))
     left = [0.0] * len(names)
-    colours = mpl.colormaps["tab20"](range(20))  # more parts than a palette safe for all has colours
+    colours = mpl.colormaps["tab20"](
+        range(20)
+    )  # more parts than a palette safe for all has colours
     for part, colour in zip(every, colours, strict=False):
         widths = [found[name].get(part, 0.0) for name in names]
         bars = axes.barh(names, widths, left=left, color=colour, label=part)

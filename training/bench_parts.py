@@ -17,11 +17,14 @@ PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pfnn_trust")
 REST = "rest"
 _STEPS, _WARM_UP = 200, 20
 _FUNCTIONS = {  # where a name is looked up: what its time is called
-    "agents.pf._normal": "noise",
+    "agents.pf.normal": "noise",
     "agents.pf.heard": "messages",
     "agents.pf.moments": "moments",
-    "agents.pf.systematic": "resampling",
-    "agents.pf.liu_west": "resampling",
+    "agents.particles.renewal.moments": "moments",
+    "agents.particles.renewal.systematic": "resampling",
+    "agents.particles.renewal.liu_west": "resampling",
+    "agents.particles.renewal.effective_sample_size": "weights",
+    "agents.particles.renewal.normalized": "weights",
     "agents.pf.log_likelihood": "likelihood",
     "agents.pf.effective_sample_size": "weights",
     "agents.pf.normalized": "weights",
