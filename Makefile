@@ -16,11 +16,11 @@ $(VENV)/.installed: pyproject.toml
 
 demo: setup
 	$(BIN)/coloc evaluate indoor-v0 --runs $(RUNS) --out $(OUT)/indoor \
-		--agents dead_reckoning,ekf,ekf:fusion=ci,ekf_joint,pf500,pf800
+		--agents dead_reckoning,ekf,ekf_trust,ekf_joint,pf800,pfnn
 	$(BIN)/coloc render indoor-v0 --agent ekf --steps 150 --out $(OUT)/indoor/scene.png
 	@if $(BIN)/python -c "from coloc_env.datasets import sequences; exit(not sequences('mrclam'))" 2>/dev/null; \
 	then $(BIN)/coloc evaluate replay-mrclam-v0 --runs 1 --no-bound --out $(OUT)/mrclam \
-		--agents dead_reckoning,ekf,ekf:robust=huber,ekf:robust=huber:cooperate=false; \
+		--agents dead_reckoning,ekf,ekf:robust=huber,ekf_trust,ekf:robust=huber:cooperate=false; \
 	else echo "No recordings found: see README.md, 'Real recordings', for where they come from."; fi
 	@echo "Tables and figures are in $(OUT)/"
 

@@ -7,6 +7,7 @@ slows all alike; the figure is the best round, the median beside it tells how no
 import json
 import math
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
@@ -35,6 +36,7 @@ T = TypeVar("T")
 NAMES = (*FIGURES, "bench.json")
 PARTICLES = (100, 300, 1000, 3000)
 TEAMS = (2, 6, 12, 24)
+COMPILED = ("pf800:compile=true", "pfnn:compile=true")
 _RATIOS = {  # ours to theirs, six agents each
     "PettingZoo / mpe2": ("PettingZoo N=6", "mpe2 simple_spread B=1"),
     "World / VMAS, B=1": ("World B=1", "VMAS simple_spread B=1"),
@@ -173,6 +175,8 @@ def _localizers(quick: bool) -> dict[str, Any]:
     if "pf800" in LOCALIZERS:
         tasks += [("particles", str(m), f"pf800:particles={m}", 6) for m in PARTICLES]
         tasks += [("teams", str(n), "pf800", n) for n in TEAMS]
+    if shutil.which("c++") or shutil.which("g++"):
+        tasks += [("agents", name, name, 6) for name in COMPILED]
     found: dict[str, dict[str, float | None]] = {"agents": {}, "particles": {}, "teams": {}}
     chosen = tasks[:1] if quick else tasks
     for group, key, agent, n in _track(chosen, "agents"):

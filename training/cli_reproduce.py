@@ -35,6 +35,13 @@ def reproduce(
         str | None,
         typer.Option(metavar="A,B,C", help="These agents only; others' figures stay empty."),
     ] = None,
+    variants: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,C", help="These variants of the study beyond only."),
+    ] = None,
+    report_only: Annotated[
+        bool, typer.Option("--report-only", help="Fly nothing: report what DIR/store has.")
+    ] = False,
     steps: Annotated[
         int | None, typer.Option(help="Cut runs to so many steps: for a quick look.")
     ] = None,
@@ -56,6 +63,9 @@ def reproduce(
     coloc reproduce pfnn --out results/pfnn --jobs 2
 
     coloc reproduce pfnn --out results/quick --part paper --runs 4 --steps 200
+
+    coloc reproduce pfnn --out results/pfnn --part robustness --agents ekf,ekf_trust
+    --variants default,nlos,hard
     """
     for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
         if value is not None and value < 1:
@@ -72,10 +82,11 @@ def reproduce(
 
     torch.set_num_threads(1)
     wanted = None if agents is None else split_agents(agents)
+    where = None if variants is None else variants.split(",")
     if fresh:
         shutil.rmtree(out / "store", ignore_errors=True)
     with _progress() as tell:
-        run(out, part.value, runs, seed, wanted, steps, jobs, tell, _say)
+        run(out, part.value, runs, seed, wanted, where, steps, jobs, not report_only, tell, _say)
     typer.echo(f"written to {out}/report.md")
 
 

@@ -137,6 +137,11 @@ class Study:
                 self.failed[piece.variant.key, piece.agent] = str(error)
         return left
 
+    def do_without(self, pieces: Sequence[Piece]) -> None:
+        """Note in ``failed`` what has not been computed."""
+        for piece in self.missing(pieces):
+            self.failed[piece.variant.key, piece.agent] = "not flown"
+
     def can(self, variant: Variant) -> bool:
         """Whether the variant's worlds are there."""
         return (variant.key, WORLD) not in self.failed

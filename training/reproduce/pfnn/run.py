@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from agents.localizer import make
+from coloc_env.options import unknown
 from training.evaluate import Progress
 from training.reproduce.cost import measured
 from training.reproduce.pfnn import paper, report
@@ -36,21 +37,30 @@ def reproduce(
     runs: int,
     seed: int,
     agents: Sequence[str] | None,
+    where: Sequence[str] | None,
     steps: int | None,
     jobs: int,
+    missing: bool,
     tell: Progress,
     note: Note,
 ) -> None:
     """Fly what the store in ``out`` lacks, then write the report of ``part`` there.
 
-    ``agents``: those wanted, of the paper's and for the study of robustness; None: all. ``steps``:
-    at most so many of each run.
+    ``agents``: those wanted, of the paper's and for the study of robustness; ``where``: in which of
+    its variants; None: all. ``steps``: at most so many of each run. ``missing=False`` flies
+    nothing.
     """
     own, beyond = part != "robustness", part != "paper"
     methods = chosen(TABLE_AGENTS, agents) if own else []
     ranges = chosen(tuple(ablation_agents()), agents) if own else []
     robust = list(ROBUST_AGENTS if agents is None else agents) if beyond else []
     base, worlds = default(steps), variants(steps)
+    if where is not None:
+        keys = [variant.key for variant in worlds]
+        for key in where:
+            if key not in keys:
+                raise ValueError(unknown("variant", key, keys))
+        worlds = [variant for variant in worlds if variant.key in where]
     every = list(dict.fromkeys((*methods, *ranges, *robust)))
     for agent in (*every, *(agents or ())):
         if agent not in every:
@@ -70,7 +80,10 @@ def reproduce(
         for variant in worlds:
             for agent in (WORLD, *robust):
                 pieces += study.pieces(variant, agent, runs_in(variant, runs))
-    fly(study, pieces, jobs, tell, note)
+    if missing:
+        fly(study, pieces, jobs, tell, note)
+    else:
+        study.do_without(pieces)
 
     flown = _flown(study, base, blocks, methods, ranges, tell) if own else None
     text = ["# PF-NN, reproduced", "", f"{paper.TITLE}.", ""]
