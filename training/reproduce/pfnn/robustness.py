@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,11 +57,16 @@ def cells(
     return found, bounds
 
 
-def compare(there: Mapping[str, Cell], agent: str, other: str) -> Difference | None:
-    """RMSE of ``agent`` minus that of ``other`` in the same worlds, m."""
+def compare(
+    there: Mapping[str, Cell],
+    agent: str,
+    other: str,
+    of: Callable[[Floats], Floats] = np.asarray,
+) -> Difference | None:
+    """RMSE of ``agent`` minus that of ``other`` in the same worlds, m; or of a function of them."""
     if agent not in there or other not in there or agent == other:
         return None
-    return metrics.paired_difference(there[agent].rmse, there[other].rmse)
+    return metrics.paired_difference(of(there[agent].rmse), of(there[other].rmse))
 
 
 def rows(

@@ -1,0 +1,366 @@
+"""The adaptive particle filter: its counts, its dead slots, and particles drawn under a guide."""
+
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from agents import make
+from agents.models.measurements import Block, Measurement, Neighbours
+from agents.models.process import Process
+from agents.particles import cloud, population
+from coloc_env.motion import Arena
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed, ConstantVelocity, Prior, Scenario
+from coloc_env.scenarios import make_scenario
+
+BOUNDS = (100, 800)
+VAGUE = {"landmark_std": 50.0, "uwb_std": 50.0}  # m: evidence that leaves all particles alike
+WEAK = {"landmark_std": 8.0, "uwb_std": 8.0}  # evidence that still tells particles apart
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def live_slots(belief: Any) -> Tensor:
+    """[B, N, M], from the counts alone."""
+    return torch.arange(belief.log_weights.shape[-1]) < belief.count.unsqueeze(-1)
+
+
+def errors(localizer: Any, scenario: Scenario, run: Any, seeds: Sequence[int]) -> Tensor:
+    """Distances to the truth [K, B, N]."""
+    from coloc_env.world import World
+
+    world = World(scenario, len(seeds))
+    world.reset(torch.tensor(list(seeds)))
+    truth = []
+    for estimate in run.estimates:
+        truth.append(world.truth.position)
+        world.advance(estimate.action())
+    return (run.position.double() - torch.stack(truth)).norm(dim=-1)
+
+
+# ---------------------------------------------------------------- counts
+
+
+def plain_equation_17(count: int, ess: float, low: int, high: int) -> int:
+    if ess < 0.3 * count:
+        return min(count + 100, high)
+    if ess > 0.8 * count:
+        return max(count - 50, low)
+    return count
+
+
+@given(st.integers(100, 800), st.floats(0, 1))
+@settings(deadline=None, max_examples=200)
+def test_counts_follow_equation_17(count: int, share: float) -> None:
+    ess = torch.tensor([[share * count]])
+    found = population.adapted(torch.tensor([[count]]), ess, BOUNDS)
+    assert int(found) == plain_equation_17(count, float(ess), *BOUNDS)
+
+
+def test_counts_between_the_thresholds_stay() -> None:
+    table = [  # count, effective sample size, next count
+        (300, 89.0, 400),
+        (300, 91.0, 300),
+        (300, 239.0, 300),
+        (300, 241.0, 250),
+        (750, 10.0, 800),
+        (800, 10.0, 800),
+        (120, 119.0, 100),
+        (100, 100.0, 100),
+    ]
+    count, ess, after = (torch.tensor(column) for column in zip(*table, strict=True))
+    assert population.adapted(count[None], ess[None], BOUNDS)[0].tolist() == after.tolist()
+
+
+def test_counts_grow_where_evidence_is_sharp(tools: SimpleNamespace) -> None:
+    """In the room a likelihood leaves less than 0.3 of the particles at most steps."""
+    scenario = make_scenario("indoor-v0")
+    beliefs = tools.play(make("apf", scenario), scenario, [0, 1], 50).beliefs
+    counts = torch.stack([belief.count for belief in beliefs])
+    assert (counts[0] == 300).all()
+    assert (counts.amax(0) == 800).all()
+    assert counts[40:].double().mean() > 700
+    assert set(counts.diff(dim=0).unique().tolist()) <= {-50, 0, 50, 100}
+
+
+def test_counts_shrink_where_particles_agree(tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0", **VAGUE, believed_uwb_std=50.0)
+    beliefs = tools.play(make("apf", scenario), scenario, [0, 1], 25).beliefs
+    counts = torch.stack([belief.count for belief in beliefs])
+    assert (counts.diff(dim=0)[:3] == -50).all()
+    assert (counts[-1] == 100).all()
+
+
+def test_counts_without_bounds_stay(tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0")
+    for belief in tools.play(make("pf500", scenario), scenario, [0], 6).beliefs:
+        assert (belief.count == 500).all()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ({"bounds": (400, 800)}, r"bounds=\(400, 800\) is not allowed"),
+        ({"bounds": (100, 200)}, r"particles \(300\)"),
+        ({"bounds": (9, 800)}, "10 ≤ low"),
+        ({"particles": 900}, r"particles \(900\)"),
+        ({"particles": 9, "bounds": None}, "at least 10"),
+    ],
+)
+def test_bounds_that_do_not_hold_the_count_are_refused(chosen: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words) as error:
+        make("apf", make_scenario("indoor-v0"), **chosen)
+    assert "\n" not in str(error.value)
+
+
+def test_bounds_come_in_the_name() -> None:
+    localizer: Any = make("apf:particles=50:bounds=20,60", make_scenario("indoor-v0"))
+    assert (localizer.particles, localizer.bounds, localizer.capacity) == (50, (20, 60), 60)
+
+
+# ---------------------------------------------------------------- live and dead
+
+
+def test_live_particles_are_weighed_and_dead_ones_are_not(tools: SimpleNamespace) -> None:
+    for overrides in ({}, VAGUE):
+        scenario = make_scenario("indoor-v0", **overrides)
+        for belief in tools.play(make("apf", scenario), scenario, [0, 1, 2], 12).beliefs:
+            live = live_slots(belief)
+            assert ((belief.count >= 100) & (belief.count <= 800)).all()
+            assert (belief.log_weights[~live] == -math.inf).all()
+            assert belief.log_weights[live].isfinite().all()
+            total = belief.log_weights.double().exp().sum(-1)
+            torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=1e-5)
+            assert belief.particles.isfinite().all()
+            assert (belief.ess_share > 0).all()
+            assert (belief.ess_share < 1 + 1e-5).all()
+
+
+@pytest.mark.parametrize("name", ["apf", "apf:proposal=ekf", "apf:robust=huber", "pfnn"])
+@pytest.mark.parametrize("k", [1, 8])
+def test_dead_slots_never_matter(name: str, k: int, tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0")
+    localizer = make(name, scenario)
+    run = tools.play(localizer, scenario, [0, 1], k + 1)
+    belief = run.beliefs[k].clone()
+    live = live_slots(belief)
+    assert not live.all()
+    rubbish = 30 * torch.randn(belief.particles.shape, generator=generator())
+    belief.particles = torch.where(live.unsqueeze(-1), belief.particles, rubbish)
+    after, estimate = localizer.step(belief, run.observations[k])
+    tools.assert_same(estimate, run.estimates[k])
+    tools.assert_same(after, run.beliefs[k + 1])
+
+
+def test_heaviest_first_orders_those_asked_for() -> None:
+    particles = torch.randn(2, 3, 40, 6, generator=generator())
+    log_weights = torch.randn(2, 3, 40, generator=generator(1))
+    log_weights[..., 30:] = -math.inf
+    rows = torch.tensor([[True, False, True], [False, False, True]])
+    moved, kept = population.heaviest_first(particles, log_weights, rows)
+    for b in range(2):
+        for n in range(3):
+            order = list(range(40))
+            if rows[b, n]:
+                order.sort(key=lambda i: -float(log_weights[b, n, i]))  # noqa: B023
+            assert torch.equal(moved[b, n], particles[b, n, order])
+            assert torch.equal(kept[b, n], log_weights[b, n, order])
+
+
+def test_the_heaviest_are_kept_as_they_are(tools: SimpleNamespace) -> None:
+    """A count that falls only leaves light particles out; ``bounds`` that forbid it show them."""
+    scenario = make_scenario("indoor-v0", **WEAK, believed_uwb_std=8.0)
+    shrinks, stays = (make("apf", scenario, bounds=(low, 800)) for low in (100, 300))
+    run = tools.play(shrinks, scenario, [0, 1], 1)
+    found = run.beliefs[1]
+    whole, _ = stays.step(run.beliefs[0], run.observations[0])
+    assert (found.count == 250).all()
+    assert (whole.count == 300).all()
+    for b in range(2):
+        for n in range(6):
+            weights = whole.log_weights[b, n, :300]
+            assert weights.max() - weights.min() > 0.1
+            order = weights.argsort(descending=True, stable=True)[:250]
+            assert torch.equal(found.particles[b, n, :250], whole.particles[b, n, order])
+            expected = weights[order].double().log_softmax(-1).float()
+            torch.testing.assert_close(found.log_weights[b, n, :250], expected, rtol=0, atol=1e-6)
+
+
+def test_rows_of_differing_counts_are_their_own_runs(tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0")
+    localizer = make("apf", scenario)
+    many = tools.play(localizer, scenario, range(5), 12)
+    counts = many.beliefs[-1].count
+    assert len(counts.amax(-1).unique()) > 1  # or batches would work on as many slots as rows do
+    for seed in range(5):
+        alone = tools.play(localizer, scenario, [seed], 12)
+        for one, other in zip(alone.estimates, many.estimates, strict=True):
+            tools.assert_same(one, other[seed : seed + 1])
+        tools.assert_same(alone.beliefs[-1], many.beliefs[-1][seed : seed + 1])
+
+
+# ---------------------------------------------------------------- resampling with counts
+
+
+def test_resampling_to_another_count_is_unbiased() -> None:
+    m, draws = 50, 4000
+    w = torch.rand(m, generator=generator()) ** 3
+    w[40:] = 0.0
+    offsets = (torch.arange(draws) + 0.5) / draws
+    for count in (7, 33, 50):
+        rungs = torch.full((1, draws), count)
+        index = cloud.systematic(w.expand(1, draws, m), offsets.unsqueeze(0), rungs)[..., :count]
+        counts = torch.nn.functional.one_hot(index, m).double().sum(-2)
+        mean = count * w.double() / w.double().sum()
+        assert ((counts - mean).abs() < 1 + 1e-4).all()
+        torch.testing.assert_close(counts.mean((0, 1)), mean, rtol=0, atol=2e-3)
+
+
+def test_each_uav_is_resampled_to_its_own_count() -> None:
+    w = torch.rand(2, 3, 40, generator=generator())
+    offset = torch.rand(2, 3, generator=generator(1))
+    count = torch.tensor([[10, 20, 40], [11, 39, 1]])
+    together = cloud.systematic(w, offset, count)
+    for b in range(2):
+        for n in range(3):
+            k = int(count[b, n])
+            alone = cloud.systematic(w[b, n].view(1, 1, -1), offset[b, n].view(1, 1), count[b, n])
+            assert torch.equal(together[b, n, :k], alone[0, 0, :k])
+            rungs = (torch.arange(k) + offset[b, n].double()) / k
+            share = w[b, n].double().cumsum(-1) / w[b, n].double().sum()
+            assert torch.equal(together[b, n, :k], torch.searchsorted(share, rungs, right=True))
+
+
+# ---------------------------------------------------------------- drawn under a guide
+
+
+@pytest.mark.parametrize("far", [3.0, 50.0, 1e4])
+def test_a_planted_measurement_is_survived(far: float, tools: SimpleNamespace) -> None:
+    """One step of lies, believed or not, leaves a finite belief; some honest ones, the truth."""
+    scenario, seeds, lies = make_scenario("indoor-v0"), [0, 1, 2], 12
+    localizer = make("apf", scenario)
+    honest = tools.play(localizer, scenario, seeds, 40)
+    told = list(honest.observations)
+    told[lies] = tools.change(told[lies], landmarks=told[lies]["landmarks"] + far)
+    run = tools.replay(localizer, told)
+    for belief, estimate in zip(run.beliefs, [run.estimates[0], *run.estimates], strict=True):
+        assert belief.particles.isfinite().all()
+        assert estimate.position.isfinite().all()
+        assert (torch.linalg.eigvalsh(estimate.covariance.double()) > 0).all()
+    error = errors(localizer, scenario, run, seeds)
+    assert error[lies].mean() > 2  # it did believe it
+    assert error[-5:].max() < 0.3
+
+
+# A linear world: each UAV measures its own position, so that the Kalman filter is the answer.
+
+N, D, DT, FIX = 3, 3, 0.5, 0.8
+PRIOR = Prior(position_std=1.5, velocity_std=0.5)
+BELIEVED = Believed(
+    arena=Arena(D, N, DT, (-50.0,) * D, (50.0,) * D),
+    slots=N,
+    process=ConstantVelocity(0.6, 2.0),
+    sensors=(),
+    prior=PRIOR,
+)
+
+
+class Fixes(Measurement):
+    """z = p + noise."""
+
+    def linearize(
+        self,
+        process: Process,
+        x: Tensor,
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        residual = observation["fix"].to(x.dtype).unsqueeze(-2) - x[..., None, :D]
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
+        jacobian[..., :D] = torch.eye(D)
+        variance = x.new_tensor(FIX**2).expand_as(residual)
+        return Block(residual, jacobian, variance, observation["fix_mask"] > 0)
+
+
+def fixes(steps: int, worlds: int = 2) -> list[Observation]:
+    """Fixes of UAVs near the origin; ``prior`` is the filters' own."""
+    g = generator(4)
+    std = torch.tensor([PRIOR.position_std] * D + [PRIOR.velocity_std, 0.05])
+    mean = torch.cat((torch.randn(worlds, N, 2 * D, generator=g), torch.zeros(worlds, N, 4)), -1)
+    prior = torch.cat((mean, std.expand(worlds, N, -1)), -1)
+    silent = {"messages": torch.zeros(worlds, N, N * 3 * D)}
+    silent |= {name: torch.zeros(worlds, N, N) for name in ("message_mask", "links")}
+    return [
+        Observation(
+            {
+                "prior": prior,
+                "fix": mean[..., :D] + 1.2 * torch.randn(worlds, N, D, generator=g),
+                "fix_mask": torch.ones(worlds, N, 1),
+                **silent,
+            }
+        )
+        for _ in range(steps)
+    ]
+
+
+def in_the_linear_world(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    for module in ("ekf", "pf"):
+        monkeypatch.setattr(f"agents.{module}.make_measurements", lambda _: [Fixes()])
+    return make(name, SimpleNamespace(believed=BELIEVED))  # type: ignore[arg-type]
+
+
+def test_guided_particles_have_exact_weights(
+    monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace
+) -> None:
+    """Drawn from 1.1 × the posterior P, weights are those of N(P) against N(1.1 P): the posterior
+    comes out, not 1.1 × it, and of the count M (√(2·1.1 − 1) / 1.1)ᴱ M are effective."""
+    m, seen = 20_000, fixes(5)
+    kalman = tools.replay(in_the_linear_world("ekf", monkeypatch), seen)
+    name = f"pf500:particles={m}:proposal=ekf"
+    guided = tools.replay(in_the_linear_world(name, monkeypatch), seen)
+    for ours, exact in zip(guided.estimates, kalman.estimates, strict=True):
+        std = exact.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        assert ((ours.position - exact.position) / std).abs().max() < 0.05
+        apart = ours.covariance - exact.covariance
+        assert (apart / (std.unsqueeze(-1) * std.unsqueeze(-2))).abs().max() < 0.06
+    share = torch.stack([belief.ess_share for belief in guided.beliefs[1:]])
+    expected = (math.sqrt(2 * 1.1 - 1) / 1.1) ** (2 * D)
+    assert (share - expected).abs().max() < 0.01
+
+
+def test_guided_and_plain_particles_stand_for_the_same_posterior(
+    monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace
+) -> None:
+    seen = fixes(4)
+    names = (f"pf500:particles=20000:proposal={p}" for p in ("prior", "ekf"))
+    plain, guided = (tools.replay(in_the_linear_world(n, monkeypatch), seen) for n in names)
+    for one, other in zip(plain.estimates, guided.estimates, strict=True):
+        std = one.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        assert ((one.position - other.position) / std).abs().max() < 0.1
+        spread = other.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        assert (spread / std - 1).abs().max() < 0.06
+
+
+# ---------------------------------------------------------------- compiled
+
+
+@pytest.mark.slow
+def test_a_compiled_filter_says_the_same(tools: SimpleNamespace) -> None:
+    """In a room of few particles, so that nothing is resampled differently by a last digit."""
+    scenario = make_scenario("indoor-v0", n_uavs=2)
+    run = tools.play(make("apf", scenario), scenario, [0, 1], 4)
+    compiled = tools.replay(make("apf:compile=true", scenario), run.observations)
+    for one, other in zip(compiled.estimates, run.estimates, strict=True):
+        torch.testing.assert_close(one.position, other.position, rtol=0, atol=1e-4)
+        torch.testing.assert_close(one.covariance, other.covariance, rtol=1e-2, atol=1e-5)
+    assert torch.equal(compiled.beliefs[-1].count, run.beliefs[-1].count)
