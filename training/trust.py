@@ -133,7 +133,7 @@ def trust(
     *,
     scenario: str = "indoor-v0:horizon=100",
     worlds: int = 16,
-    epochs: int = 10,
+    epochs: int = 8,
     steps: int = 10,
     learning_rate: float = 2e-3,
     seed: int = 0,

@@ -125,8 +125,8 @@ def test_a_network_that_prefers_particles_gets_them(tools: SimpleNamespace) -> N
         localizer.corrector.out.weight[0, 0] = 10.0
     plain = make("apf", scenario)
     run = tools.play(plain, scenario, [0, 1], 6)
-    moved, _ = zip(*[localizer.step(run.beliefs[k], run.observations[k]) for k in (4, 5)])
-    for k, belief in zip((4, 5), moved, strict=True):
+    for k in (4, 5):
+        belief, _ = localizer.step(run.beliefs[k], run.observations[k])
         assert (belief.last[..., 0] - run.beliefs[k + 1].last[..., 0]).mean() > 1e-3
 
 
@@ -179,6 +179,14 @@ def test_rows_of_a_layer_do_not_round_by_their_number(m: int, inputs: int, outpu
         many = layer(x)
         for b in (0, 34, 69):
             assert torch.equal(layer(x[b : b + 1].clone()), many[b : b + 1])
-            assert torch.equal(layer(x[b : b + 1, 2:3].clone()), many[b : b + 1, 2:3])
         expected = torch.nn.functional.linear(x, layer.weight, layer.bias)
     torch.testing.assert_close(many, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.xfail(strict=True, reason="one product of one column alone takes another kernel")
+@pytest.mark.parametrize("m", [53, 800])
+def test_a_uav_all_alone_does_not_round_otherwise(m: int) -> None:
+    torch.manual_seed(0)
+    layer, x = Linear(12, 1), normal(2, 6, m, 12)
+    with torch.no_grad():
+        assert torch.equal(layer(x[:1, :1].clone()), layer(x)[:1, :1])
