@@ -280,7 +280,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         away = self.process.boxminus(particles, mean).double()
         root = torch.linalg.cholesky_ex(guide.prior.covariance).L
         scaled = torch.linalg.solve_triangular(root, away.mT, upper=False)
-        ratio = 0.5 * (draws.square().sum(-1) - scaled.square().sum(-2))
+        ratio = 0.5 * (draws.double().square().sum(-1) - scaled.square().sum(-2))
         live = population.alive(now.belief.count, slots)
         return particles, normalized(torch.where(live, ratio, -torch.inf).to(draws.dtype))
 

@@ -98,7 +98,8 @@ class TrustScreen(Screen):
         for i, first, memory in zip(self.judged, evidence.first, evidence.memory, strict=True):
             block = blocks[i]
             seen = features(block, first, evidence.own_std, evidence.counts, memory)
-            seen = seen.detach().to(torch.float32)
+            # What stands behind a mask may be anything; the networks must not see it.
+            seen = seen.detach().to(torch.float32).masked_fill(~block.mask.unsqueeze(-1), 0.0)
             if i in self.ranges:
                 weight, bias = self.network.trust_ranges(seen)
                 shift = bias * block.variance[..., 0].sqrt()

@@ -183,7 +183,6 @@ def test_rows_of_a_layer_do_not_round_by_their_number(m: int, inputs: int, outpu
     torch.testing.assert_close(many, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.xfail(strict=True, reason="one product of one column alone takes another kernel")
 @pytest.mark.parametrize("m", [53, 800])
 def test_a_uav_all_alone_does_not_round_otherwise(m: int) -> None:
     torch.manual_seed(0)
