@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.checkpoint import Learned
-from agents.layers import Linear
+from agents.layers import Linear, sigmoid
 
 HIDDEN = 12
 
@@ -26,7 +26,7 @@ class WeightCorrector(Learned):
         self.out = Linear(HIDDEN, 1)
 
     def forward(self, features: Float[Tensor, "*s 6"]) -> Float[Tensor, "*s"]:
-        return torch.sigmoid(self.out(torch.tanh(self.hidden(features))))[..., 0]
+        return sigmoid(self.out(torch.tanh(self.hidden(features))))[..., 0]
 
 
 def motion_features(

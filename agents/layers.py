@@ -1,5 +1,10 @@
-"""Layers of small networks inside filters."""
+"""Layers of small networks inside filters.
 
+torch's own sigmoid, SiLU and softplus round differently in vectorized bodies and tails, which would
+make a UAV's numbers depend on how many share its batch; tanh, exp and log1p do not.
+"""
+
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -18,3 +23,20 @@ class Linear(nn.Linear):
             weight = weight.expand(-1, 2)
         product = x @ weight.expand(*x.shape[:-2], *weight.shape)
         return product[..., : self.out_features] + self.bias
+
+
+def sigmoid(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """1 / (1 + e^−x)."""
+    return 0.5 + 0.5 * torch.tanh(0.5 * x)
+
+
+def softplus(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """log(1 + eˣ)."""
+    return torch.log1p(torch.exp(x))
+
+
+class SiLU(nn.Module):
+    """x σ(x)."""
+
+    def forward(self, x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+        return x * sigmoid(x)

@@ -2,12 +2,11 @@
 
 import math
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from agents.checkpoint import Learned
-from agents.layers import Linear
+from agents.layers import Linear, SiLU, sigmoid, softplus
 
 HIDDEN = 32
 SHARED = (
@@ -36,7 +35,7 @@ def _layers(inputs: int, outputs: int) -> nn.Sequential:
     last = Linear(HIDDEN, outputs)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
-    return nn.Sequential(Linear(inputs, HIDDEN), nn.SiLU(), Linear(HIDDEN, HIDDEN), nn.SiLU(), last)
+    return nn.Sequential(Linear(inputs, HIDDEN), SiLU(), Linear(HIDDEN, HIDDEN), SiLU(), last)
 
 
 class TrustNetwork(Learned):
@@ -56,11 +55,11 @@ class TrustNetwork(Learned):
 
     def trust_vectors(self, features: Float[Tensor, "*s 12"]) -> Float[Tensor, "*s"]:
         """Weights of vector measurements."""
-        return torch.sigmoid(_AT_FIRST + self.vectors(features)[..., 0])
+        return sigmoid(_AT_FIRST + self.vectors(features)[..., 0])
 
     def trust_ranges(
         self, features: Float[Tensor, "*s 15"]
     ) -> tuple[Float[Tensor, "*s"], Float[Tensor, "*s"]]:
         """Weights of ranges, and biases over the noise's standard deviation."""
         weight, bias = self.ranges(features).unbind(-1)
-        return torch.sigmoid(_AT_FIRST + weight), nn.functional.softplus(bias - 4.0)
+        return sigmoid(_AT_FIRST + weight), softplus(bias - 4.0)

@@ -84,11 +84,11 @@ def test_counts_between_the_thresholds_stay() -> None:
 def test_counts_grow_where_evidence_is_sharp(tools: SimpleNamespace) -> None:
     """In the room a likelihood leaves less than 0.3 of the particles at most steps."""
     scenario = make_scenario("indoor-v0")
-    beliefs = tools.play(make("apf", scenario), scenario, [0, 1], 50).beliefs
+    beliefs = tools.play(make("apf", scenario), scenario, [0, 1], 80).beliefs
     counts = torch.stack([belief.count for belief in beliefs])
     assert (counts[0] == 300).all()
     assert (counts.amax(0) == 800).all()
-    assert counts[40:].double().mean() > 700
+    assert counts[60:].double().mean() > 700
     assert set(counts.diff(dim=0).unique().tolist()) <= {-50, 0, 50, 100}
 
 
