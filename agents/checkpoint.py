@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -28,6 +28,24 @@ class Learned(nn.Module):
 
     kind: ClassVar[str]
     features: ClassVar[tuple[str, ...]]
+
+
+_L = TypeVar("_L", bound=Learned)
+
+
+def untrained(kind: type[_L], seed: int) -> _L:
+    """A neural part with random weights, drawn from ``seed`` and from no shared generator."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return kind()
+
+
+def learned(kind: type[_L], weights: str, seed: int = 0) -> _L:
+    """A neural part with a checkpoint's weights (``load``); untrained for ``none``."""
+    module = untrained(kind, seed)
+    if weights != "none":
+        load(weights, module)
+    return module
 
 
 def load(source: str | Path, module: Learned) -> dict[str, Any]:

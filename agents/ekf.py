@@ -18,7 +18,7 @@ from torch import Tensor
 from agents.localizer import Estimate, Localizer, register
 from agents.models.measurements import Block, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
-from agents.models.update import information, iterated_update, posterior
+from agents.models.update import information, iterated_update, linearizer, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -155,12 +155,7 @@ class CooperativeEkf(DeadReckoning):
         if not self.models:
             return super().update(prior)
         neighbours = heard(self.believed, prior.observation)
-
-        def linearize(at: Tensor) -> Sequence[Block]:
-            return [
-                m.linearize(self.process, at, prior.observation, neighbours) for m in self.models
-            ]
-
+        linearize = linearizer(self.process, self.models, prior.observation, neighbours)
         found = iterated_update(prior, linearize, self.screen, self.iterations)
         if self.fusion == "naive":
             return found.state, found.covariance, found.memory
@@ -178,18 +173,13 @@ class CooperativeEkf(DeadReckoning):
         x, covariance = prior.state, prior.covariance
         if own:
             models, fixed = zip(*own, strict=True)
-
-            def linearize(at: Tensor) -> Sequence[Block]:
-                return [
-                    m.linearize(self.process, at, prior.observation, neighbours) for m in models
-                ]
-
+            linearize = linearizer(self.process, models, prior.observation, neighbours)
             screen = Fixed(self.process, models, fixed)
             found = iterated_update(prior, linearize, screen, self.iterations)
             x, covariance = found.state, found.covariance
         if shared:
             models, fixed = zip(*shared, strict=True)
-            blocks = [m.linearize(self.process, x, prior.observation, neighbours) for m in models]
+            blocks = linearizer(self.process, models, prior.observation, neighbours)(x)
             x, covariance = self._intersect(x, covariance, blocks, fixed)
         return x, covariance
 

@@ -110,7 +110,7 @@ class JointEkf(Localizer[GaussianBelief]):
         for iteration in range(-extra, self.iterations):
             blocks = self._blocks(state, observation)
             judged = blocks
-            if self.screen.methods:
+            if self.screen.judges:
                 judged = [self._doubtful(block, updated) for block in blocks]
             if iteration == -extra:
                 evidence = self.screen.judge(judged, prior)

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
-from agents.models.measurements import Block, Neighbours, heard, make_measurements
+from agents.models.measurements import Neighbours, heard, make_measurements
 from agents.models.process import make_process
-from agents.models.update import Update, iterated_update
+from agents.models.update import Update, iterated_update, linearizer
 from agents.particles import population
 from agents.particles.belief import ParticleBelief, normal, own_keys
 from agents.particles.cloud import (
@@ -116,7 +116,6 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
-        self.screens = robust != "none"
         self.renewal = Renewal(self.process, perturb, bounds)
         self.compiled = compile
         if compile:
@@ -166,7 +165,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
         now = _Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
         memory = belief.memory
-        if self.models and (self.screens or self.proposal == "ekf"):
+        if self.models and (self.screen.judges or self.proposal == "ekf"):
             particles = self.process.propagate(particles, u, dt, draws[..., :w])
             guide = self._guide(particles, log_weights, now)
             now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
@@ -258,12 +257,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             self.renewal.floor.to(cloud.covariance.device) ** 2
         )
         prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
-
-        def linearize(at: Tensor) -> Sequence[Block]:
-            return [
-                m.linearize(self.process, at, now.observation, now.neighbours) for m in self.models
-            ]
-
+        linearize = linearizer(self.process, self.models, now.observation, now.neighbours)
         return _Guide(prior, iterated_update(prior, linearize, self.screen, _ITERATIONS))
 
     def _drawn(
@@ -296,7 +290,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """Particles and unnormalized log-weights where the evidence would leave too few: in the
         first steps used in stages with a resampling move after each; later, or where a screen has a
         guide at hand, on particles drawn anew. A UAV that needs neither is not touched."""
-        late = short if self.screens else short & (now.belief.step >= _START_STEPS)
+        late = short if self.screen.judges else short & (now.belief.step >= _START_STEPS)
         early = short & ~late
         if bool(late.any()):
             guide = guide or self._guide(particles, log_weights, now)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.checkpoint import load
+from agents.checkpoint import learned
 from agents.corrector import WeightCorrector, motion_features
 from agents.localizer import register
 from agents.particles.belief import ParticleBelief
@@ -39,11 +39,7 @@ class NeuralParticleFilter(AdaptiveParticleFilter):
                 f"correction={correction} is not allowed: low,high with 0 < low ≤ high"
             )
         self.correction = correction
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed)
-            self.corrector = WeightCorrector()
-        if weights != "none":
-            load(weights, self.corrector)
+        self.corrector = learned(WeightCorrector, weights, self.seed)
 
     @torch.no_grad()
     def log_correction(

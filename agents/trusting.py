@@ -1,25 +1,25 @@
 """Filters that trust each measurement as far as a network says: ``ekf_trust``, ``pfnn_trust``."""
 
+from collections.abc import Sequence
 from typing import Any
 
-import torch
-
-from agents.checkpoint import load
+from agents.checkpoint import learned
 from agents.ekf import CooperativeEkf
 from agents.localizer import register
+from agents.models.measurements import Measurement
+from agents.models.process import Process
 from agents.pf import AdaptiveParticleFilter
 from agents.trust import TrustNetwork, TrustScreen
 from coloc_env.scenario import Believed
 
 
-def trust_network(weights: str) -> TrustNetwork:
-    """The networks of a checkpoint (its name or path); untrained ones for ``none``."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        network = TrustNetwork()
-    if weights != "none":
-        load(weights, network)
-    return network.requires_grad_(False)
+def _screen(
+    process: Process, models: Sequence[Measurement], weights: str, options: dict[str, Any]
+) -> TrustScreen:
+    """The screen that judges by a checkpoint's networks, and by nothing beside them."""
+    if options.get("robust", "none") != "none":
+        raise ValueError("robust is not allowed beside learned trust: none")
+    return TrustScreen(process, models, learned(TrustNetwork, weights).requires_grad_(False))
 
 
 @register("ekf_trust")
@@ -40,10 +40,8 @@ class TrustingEkf(CooperativeEkf):
         iterations: int = 3,
         **options: Any,
     ) -> None:
-        if options.get("robust", "none") != "none":
-            raise ValueError("robust is not allowed beside learned trust: none")
         super().__init__(believed, iterations=iterations, **options)
-        self.learn(trust_network(weights))
+        self.screen = _screen(self.process, self.models, weights, options)
 
     def learn(self, network: TrustNetwork) -> None:
         """Judge by these networks from now on."""
@@ -61,8 +59,5 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
     name = "pfnn_trust"
 
     def __init__(self, believed: Believed, *, weights: str = "trust", **options: Any) -> None:
-        if options.get("robust", "none") != "none":
-            raise ValueError("robust is not allowed beside learned trust: none")
         super().__init__(believed, **options)
-        self.screen = TrustScreen(self.process, self.models, trust_network(weights))
-        self.screens = True
+        self.screen = _screen(self.process, self.models, weights, options)

@@ -13,6 +13,7 @@ from torchrl.collectors import Collector
 from torchrl.objectives import LossModule
 
 from agents import make
+from agents.checkpoint import untrained
 from agents.ekf import CooperativeEkf, GaussianBelief
 from agents.policy import LocalizerPolicy
 from agents.trust import TrustNetwork
@@ -21,7 +22,7 @@ from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flights, fly, world_seed
 from training.play import play
-from training.runs import Progress, Training, make_trainer, register, scenario_of
+from training.runs import Progress, Training, at_least, make_trainer, register, scenario_of
 
 # What the networks meet: each alone, all at once, and nothing at all.
 VARIANTS = (
@@ -147,20 +148,12 @@ def trust(
     backpropagated through them. The learning rate falls linearly to a twentieth.
     ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
     """
-    for name, value, least in (
-        ("worlds", worlds, 1),
-        ("epochs", epochs, 1),
-        ("steps", steps, 1),
-        ("score_runs", score_runs, 0),
-    ):
-        if value < least:
-            raise ValueError(f"trust: {name}={value} is not allowed: at least {least}")
+    at_least("trust", 1, worlds=worlds, epochs=epochs, steps=steps)
+    at_least("trust", 0, score_runs=score_runs, seed=seed)
     if not 0 < learning_rate < float("inf"):
         raise ValueError(f"trust: learning_rate={learning_rate} is not allowed: more than 0")
     scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = TrustNetwork()
+    network = untrained(TrustNetwork, seed)
     filters: list[Any] = [make("ekf_trust", scene, weights="none") for scene in scenes]
     for one in filters:
         one.learn(network)

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.models.measurements import Block
+from agents.models.measurements import Block, Measurement, Neighbours
+from agents.models.process import Process
 from agents.robust.screen import Prediction, Screen, Trust
+from coloc_env.observation import Observation
 
 Linearize = Callable[[Float[Tensor, "B N S"]], Sequence[Block]]
 
@@ -21,6 +23,16 @@ class Update:
     covariance: Float[Tensor, "B N E E"]
     trusts: list[Trust]
     memory: Float[Tensor, "B N K"]
+
+
+def linearizer(
+    process: Process,
+    models: Sequence[Measurement],
+    observation: Observation,
+    neighbours: Neighbours,
+) -> Linearize:
+    """The models' blocks as a function of the state that they are linearized at."""
+    return lambda x: [m.linearize(process, x, observation, neighbours) for m in models]
 
 
 def information(

@@ -52,7 +52,8 @@ class RobustScreen(Screen):
             raise ValueError(f"gate={probability} is not allowed: a probability in (0, 1)")
         self.methods = _parsed(robust)
         self.probability = probability
-        self.extra = 3 if self.methods else 0
+        self.judges = bool(self.methods)
+        self.extra = 3 if self.judges else 0
         self.hard = bool(self.methods - {"huber"})
         remembers = "temporal" in self.methods and bool(models)
         self.temporal = TemporalConsistency(process, models) if remembers else None

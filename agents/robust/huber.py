@@ -1,20 +1,12 @@
 """Huber's weights: outliers count less the farther out they lie."""
 
-from functools import lru_cache
-
 from jaxtyping import Float
-from scipy.stats import chi2
 from torch import Tensor
 
 from agents.models.measurements import Block
+from agents.robust.mahalanobis import chi_square
 
 _CORE = 0.8214  # share of a Gaussian inside Huber's quadratic core for 95 % efficiency (1.345 σ)
-
-
-@lru_cache
-def chi_square(probability: float, dof: int) -> float:
-    """Quantile of the χ² distribution."""
-    return float(chi2.ppf(probability, dof))
 
 
 def huber_weights(block: Block) -> Float[Tensor, "B N m"]:

@@ -57,10 +57,12 @@ class Prediction:
 class Screen(ABC):
     """Judges the blocks of some measurement models.
 
-    ``exchanges``: it looks at what linked neighbours measured, so that one localizer must act for
-    the whole team. ``extra``: more iterations that it wants where the prior is broad.
+    ``judges``: it may trust a measurement less than another. ``exchanges``: it looks at what linked
+    neighbours measured, so that one localizer must act for the whole team. ``extra``: more
+    iterations that it wants where the prior is broad.
     """
 
+    judges = True
     exchanges = False
     extra = 0
 
