@@ -20,6 +20,8 @@ ROBUST_AGENTS = (
     "ekf_trust",
     "pfnn_trust",
 )
+_FULL = ("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20")
+_FULL += ("few-nlos", "few-nlos-false", "hard", "away-nlos-false")
 
 
 def ablation_agents() -> dict[str, tuple[float, float]]:
@@ -72,8 +74,11 @@ def variants(steps: int | None = None) -> list[Variant]:
 
 
 def runs_in(variant: Variant, runs: int) -> int:
-    """A quarter of the runs for recordings, which differ in the prior's draw alone."""
-    return max(1, runs // 4) if variant.scenario.startswith("replay") else runs
+    """Half the runs for motions and places that bring no difficulty of their own; a quarter for
+    recordings, which differ in the prior's draw alone."""
+    if variant.scenario.startswith("replay"):
+        return max(1, runs // 4)
+    return runs if variant.key in _FULL else max(1, runs // 2)
 
 
 def chosen(agents: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
