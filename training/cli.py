@@ -1,21 +1,15 @@
 """The ``coloc`` command. Heavy imports wait until a command needs them, so that help is instant."""
 
-import inspect
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from typer.core import TyperGroup
 
 from training.cli_reproduce import reproduce
 from training.cli_train import train
+from training.terminal import explain, progress, show, summary
 
 if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
@@ -122,13 +116,13 @@ def evaluate(
 
     names = split_agents(agents)
 
-    with staged_folder(out, files.NAMES) as folder, _progress() as tell:
+    with staged_folder(out, files.NAMES) as folder, progress() as tell:
         found = run(built, names, runs, seed, tell, bound=bound)
         tell("files", 0, 1)
         files.write(found, folder, figures)
         tell("files", 1, 1)
     columns = {key: title for key, title in files.COLUMNS.items() if key not in _TOO_WIDE}
-    _show(["", *columns.values()], files.rows(found, columns))
+    show(["", *columns.values()], files.rows(found, columns))
     for name, one in found.agents.items():
         if one.raised:
             what = f"{name} raised in {one.raised} of {found.runs} runs; first at {one.message}"
@@ -144,10 +138,10 @@ def scenarios(
     from coloc_env.scenarios import FAMILIES, overrides_of
 
     if name is None:
-        _show(["scenario", ""], [[key, _summary(FAMILIES[key])] for key in sorted(FAMILIES)])
+        show(["scenario", ""], [[key, summary(FAMILIES[key])] for key in sorted(FAMILIES)])
         typer.echo("coloc scenarios SCENARIO lists what can be --set in one.")
     else:
-        _explain(name, overrides_of(name), "override", lambda: FAMILIES[name])
+        explain(name, overrides_of(name), "override", FAMILIES[name])
 
 
 @app.command()
@@ -158,10 +152,10 @@ def agents(
     from agents import LOCALIZERS, options_of
 
     if name is None:
-        _show(["agent", ""], [[key, _summary(LOCALIZERS[key])] for key in sorted(LOCALIZERS)])
+        show(["agent", ""], [[key, summary(LOCALIZERS[key])] for key in sorted(LOCALIZERS)])
         typer.echo("coloc agents AGENT lists its options, written AGENT:option=value:option=value.")
     else:
-        _explain(name, options_of(name), "option", lambda: LOCALIZERS[name])
+        explain(name, options_of(name), "option", LOCALIZERS[name])
 
 
 @app.command()
@@ -196,7 +190,7 @@ def render(
     if not 1 <= steps <= built.horizon:
         raise ValueError(f"--steps {steps} is not allowed: 1 to {built.horizon} for {scenario}")
     every = steps if suffix == ".png" else -(-steps // _FRAMES)
-    with staged_file(out) as file, _progress() as tell:
+    with staged_file(out) as file, progress() as tell:
         localizer = make(agent, built)
         drawn = list(frames(localizer, built, seed, steps, every, lambda k: tell(agent, k, steps)))
         if suffix == ".png":
@@ -239,68 +233,6 @@ def _scenario(name: str, settings: list[str] | None, threads: int, data: Path | 
     torch.set_num_threads(threads)
     overrides = dict(parse_override(name, text) for text in settings or ())
     return replace(make_scenario(name, **overrides), overrides=overrides)
-
-
-def _summary(function: Callable[..., Any]) -> str:
-    """The first paragraph of a docstring."""
-    return _paragraphs(function)[0]
-
-
-def _paragraphs(function: Callable[..., Any]) -> list[str]:
-    """A docstring's paragraphs, one line each."""
-    text = (inspect.getdoc(function) or "").replace("``", "")
-    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
-
-
-def _explain(
-    name: str,
-    known: dict[str, inspect.Parameter],
-    kind: str,
-    function: Callable[[], Callable[..., Any]],
-) -> None:
-    from coloc_env.options import describe
-    from training.results import typed
-
-    text = "\n\n".join(map(escape, _paragraphs(function())))
-    Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
-    lines = [[key, describe(p.annotation), typed(p.default)] for key, p in known.items()]
-    if lines:
-        _show([kind, "type", "default"], lines)
-    else:
-        typer.echo(f"no {kind}s")
-
-
-def _show(header: list[str], lines: list[list[str]]) -> None:
-    """A table; where it must be narrowed, words give way to names and numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    numbers = len(header) > 3
-    for i, title in enumerate(header):
-        right = numbers and i > 0
-        table.add_column(title, justify="right" if right else "left", no_wrap=right or i == 0)
-    for line in lines:
-        table.add_row(*map(escape, line))
-    console = Console()
-    if not console.is_terminal:
-        console.width = 160
-    console.print(table, highlight=False)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Bars on stderr, one a task, where that is a terminal."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        tasks: dict[str, Any] = {}
-
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = progress.add_task(escape(what), total=total)
-            progress.update(tasks[what], completed=done, total=total)
-
-        yield tell
 
 
 def main() -> None:

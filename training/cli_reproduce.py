@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from training.terminal import progress
+
 
 class Paper(StrEnum):
     """Papers that can be reproduced."""
@@ -76,7 +78,6 @@ def reproduce(
         os.environ["COLOC_DATA"] = str(data)
     import torch
 
-    from training.cli import _progress
     from training.evaluate import split_agents
     from training.reproduce.pfnn.run import reproduce as run
 
@@ -85,7 +86,7 @@ def reproduce(
     where = None if variants is None else variants.split(",")
     if fresh:
         shutil.rmtree(out / "store", ignore_errors=True)
-    with _progress() as tell:
+    with progress() as tell:
         run(out, part.value, runs, seed, wanted, where, steps, jobs, not report_only, tell, _say)
     typer.echo(f"written to {out}/report.md")
 

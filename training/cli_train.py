@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from training.terminal import explain, progress, show, summary
+
 
 def train(
     name: Annotated[
@@ -52,8 +54,6 @@ def train(
 
     tensorboard --logdir runs
     """
-    from training.cli import _explain, _progress, _show, _summary
-
     if threads < 1:
         raise ValueError(f"--threads {threads} is not allowed: at least 1")
     # MKL's products of matrices would else depend, in their last digits, on where in memory they
@@ -71,21 +71,20 @@ def train(
     if resume is not None:
         if name is not None or out is not None or settings:
             raise ValueError("--resume goes alone: a run continues as it was started")
-        with _progress() as tell:
+        with progress() as tell:
             weights = runs.resume(resume, tell)
     elif name is None:
-        _show(["training", ""], [[k, _summary(v)] for k, v in sorted(runs.TRAININGS.items())])
+        show(["training", ""], [[k, summary(v)] for k, v in sorted(runs.TRAININGS.items())])
         typer.echo("coloc train TRAINING lists its options.")
         return
     elif out is None:
         if settings:
             raise ValueError("--out DIR is needed: the run's folder")
-        known, factory = runs.options_of(name), runs.TRAININGS[name]
-        _explain(name, known, "option", lambda: factory)
+        explain(name, runs.options_of(name), "option", runs.TRAININGS[name])
         return
     else:
         known = runs.options_of(name)
         chosen = dict(parse(name, text, known) for text in settings or ())
-        with _progress() as tell:
+        with progress() as tell:
             weights = runs.start(name, chosen, out, tell)
     typer.echo(f"weights written to {weights}")

@@ -12,12 +12,13 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from agents import LOCALIZERS, Estimate, Localizer, make, options_of
+from agents.models.measurements import Block, Measurement, Neighbours
 from agents.models.process import Process
 from coloc_env import scenario as settings
 from coloc_env.motion import Aggressive, Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.scenario import Inertial, Prior, Scenario, Wheeled
+from coloc_env.scenario import Believed, ConstantVelocity, Inertial, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     AnchorRanging,
@@ -202,6 +203,41 @@ def cloud(process: Process, spread: float, origin: float = 0.0) -> tuple[Tensor,
     return process.boxplus(centre.unsqueeze(2).expand(-1, -1, 200, -1), delta), centre
 
 
+class Fixes(Measurement):
+    """Each UAV's own position: z = p + noise of ``std`` m."""
+
+    std = 0.8
+
+    def linearize(
+        self,
+        process: Process,
+        x: Tensor,
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        d = process.dim
+        residual = observation["fix"].to(x.dtype).unsqueeze(-2) - x[..., None, :d]
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
+        jacobian[..., :d] = torch.eye(d)
+        variance = x.new_tensor(self.std**2).expand_as(residual)
+        return Block(residual, jacobian, variance, observation["fix_mask"] > 0)
+
+
+# A linear Gaussian world, where the Kalman filter is the answer. It stands in for a scenario; what
+# is measured in it, such as ``fixes``, filters are told by replacing their ``make_measurements``.
+LINEAR = SimpleNamespace(
+    believed=Believed(
+        arena=Arena(3, 3, 0.5, (-50.0,) * 3, (50.0,) * 3),
+        slots=3,
+        process=ConstantVelocity(0.6, 2.0),
+        sensors=(),
+        prior=Prior(position_std=1.5, velocity_std=0.5),
+    ),
+    fixes=Fixes(),
+)
+
+
 def change(observation: Observation, **leaves: Tensor) -> Observation:
     """The observation with some leaves replaced."""
     return Observation({**observation.leaves, **leaves})
@@ -270,6 +306,7 @@ def tools() -> SimpleNamespace:
         play=play,
         replay=replay,
         cloud=cloud,
+        linear=LINEAR,
         change=change,
         behind=behind,
         masked_pairs=masked_pairs,

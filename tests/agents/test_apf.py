@@ -12,12 +12,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from agents import make
-from agents.models.measurements import Block, Measurement, Neighbours
-from agents.models.process import Process
 from agents.particles import cloud, population
-from coloc_env.motion import Arena
 from coloc_env.observation import Observation
-from coloc_env.scenario import Believed, ConstantVelocity, Prior, Scenario
+from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
@@ -277,51 +274,24 @@ def test_a_landmark_may_be_very_far_off_for_a_step(far: float, tools: SimpleName
     assert error[-1].mean() < 0.25 * error[12].mean()
 
 
-# A linear world: each UAV measures its own position, so that the Kalman filter is the answer.
-
-N, D, DT, FIX = 3, 3, 0.5, 0.8
-PRIOR = Prior(position_std=1.5, velocity_std=0.5)
-BELIEVED = Believed(
-    arena=Arena(D, N, DT, (-50.0,) * D, (50.0,) * D),
-    slots=N,
-    process=ConstantVelocity(0.6, 2.0),
-    sensors=(),
-    prior=PRIOR,
-)
+# In the linear world, where the Kalman filter is the answer, each UAV measures its own position.
 
 
-class Fixes(Measurement):
-    """z = p + noise."""
-
-    def linearize(
-        self,
-        process: Process,
-        x: Tensor,
-        observation: Observation,
-        neighbours: Neighbours,
-        derivatives: bool = True,
-    ) -> Block:
-        residual = observation["fix"].to(x.dtype).unsqueeze(-2) - x[..., None, :D]
-        jacobian = x.new_zeros(*residual.shape, process.error_size)
-        jacobian[..., :D] = torch.eye(D)
-        variance = x.new_tensor(FIX**2).expand_as(residual)
-        return Block(residual, jacobian, variance, observation["fix_mask"] > 0)
-
-
-def fixes(steps: int, worlds: int = 2) -> list[Observation]:
-    """Fixes of UAVs near the origin; ``prior`` is the filters' own."""
-    g = generator(4)
-    std = torch.tensor([PRIOR.position_std] * D + [PRIOR.velocity_std, 0.05])
-    mean = torch.cat((torch.randn(worlds, N, 2 * D, generator=g), torch.zeros(worlds, N, 4)), -1)
-    prior = torch.cat((mean, std.expand(worlds, N, -1)), -1)
-    silent = {"messages": torch.zeros(worlds, N, N * 3 * D)}
-    silent |= {name: torch.zeros(worlds, N, N) for name in ("message_mask", "links")}
+def fixes(world: Any, steps: int) -> list[Observation]:
+    """Fixes of UAVs near the origin of two worlds; ``prior`` is the filters' own."""
+    g, team = generator(4), world.believed
+    n, d = team.arena.n_uavs, team.arena.dim
+    std = torch.tensor([team.prior.position_std] * d + [team.prior.velocity_std, 0.05])
+    mean = torch.cat((torch.randn(2, n, 2 * d, generator=g), torch.zeros(2, n, 4)), -1)
+    prior = torch.cat((mean, std.expand(2, n, -1)), -1)
+    silent = {"messages": torch.zeros(2, n, n * 3 * d)}
+    silent |= {name: torch.zeros(2, n, n) for name in ("message_mask", "links")}
     return [
         Observation(
             {
                 "prior": prior,
-                "fix": mean[..., :D] + 1.2 * torch.randn(worlds, N, D, generator=g),
-                "fix_mask": torch.ones(worlds, N, 1),
+                "fix": mean[..., :d] + 1.2 * torch.randn(2, n, d, generator=g),
+                "fix_mask": torch.ones(2, n, 1),
                 **silent,
             }
         )
@@ -329,28 +299,24 @@ def fixes(steps: int, worlds: int = 2) -> list[Observation]:
     ]
 
 
-def in_the_linear_world(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
-    for module in ("ekf", "pf"):
-        monkeypatch.setattr(f"agents.{module}.make_measurements", lambda _: [Fixes()])
-    return make(name, SimpleNamespace(believed=BELIEVED))  # type: ignore[arg-type]
-
-
 def test_guided_particles_have_exact_weights(
     monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace
 ) -> None:
     """Drawn from 1.1 × the posterior P, weights are those of N(P) against N(1.1 P): the posterior
     comes out, not 1.1 × it, and of the count M (√(2·1.1 − 1) / 1.1)ᴱ M are effective."""
-    m, seen = 20_000, fixes(5)
-    kalman = tools.replay(in_the_linear_world("ekf", monkeypatch), seen)
-    name = f"pf500:particles={m}:proposal=ekf"
-    guided = tools.replay(in_the_linear_world(name, monkeypatch), seen)
+    world = tools.linear
+    for module in ("ekf", "pf"):
+        monkeypatch.setattr(f"agents.{module}.make_measurements", lambda _: [world.fixes])
+    seen = fixes(world, 5)
+    kalman = tools.replay(make("ekf", world), seen)
+    guided = tools.replay(make("pf500:particles=20000:proposal=ekf", world), seen)
     for ours, exact in zip(guided.estimates, kalman.estimates, strict=True):
         std = exact.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         assert ((ours.position - exact.position) / std).abs().max() < 0.05
         apart = ours.covariance - exact.covariance
         assert (apart / (std.unsqueeze(-1) * std.unsqueeze(-2))).abs().max() < 0.06
     share = torch.stack([belief.ess_share for belief in guided.beliefs[1:]])
-    expected = (math.sqrt(2 * 1.1 - 1) / 1.1) ** (2 * D)
+    expected = (math.sqrt(2 * 1.1 - 1) / 1.1) ** (2 * world.believed.arena.dim)
     assert (share - expected).abs().max() < 0.01
 
 

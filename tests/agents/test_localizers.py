@@ -118,6 +118,23 @@ def test_rows_do_not_depend_on_how_many_there_are(name: str, tools: SimpleNamesp
         tools.assert_same(alone.beliefs[-1], many.beliefs[-1][seed : seed + 1], tolerance)
 
 
+@pytest.mark.parametrize("n_uavs", [1, 2])
+@pytest.mark.parametrize("name", LOCALIZERS)
+def test_a_row_of_a_small_team_is_its_own_run(
+    name: str, n_uavs: int, tools: SimpleNamespace
+) -> None:
+    """Also where a team has one pair of UAVs, or one UAV and no neighbours at all."""
+    scenario = make_scenario("indoor-v0", n_uavs=n_uavs)
+    localizer = tools.build(name, scenario)
+    tolerance = SUMMED if localizer.centralized else EXACT
+    many = tools.play(localizer, scenario, range(3), 4)
+    for seed in range(3):
+        alone = tools.play(localizer, scenario, [seed], 4)
+        for one, other in zip(alone.estimates, many.estimates, strict=True):
+            tools.assert_same(one, other[seed : seed + 1], tolerance)
+        tools.assert_same(alone.beliefs[-1], many.beliefs[-1][seed : seed + 1], tolerance)
+
+
 # ---------------------------------------------------------------- time
 
 

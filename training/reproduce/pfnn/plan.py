@@ -20,8 +20,10 @@ ROBUST_AGENTS = (
     "ekf_trust",
     "pfnn_trust",
 )
-_FULL = ("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20")
-_FULL += ("few-nlos", "few-nlos-false", "hard", "away-nlos-false")
+_FULL = (
+    *("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20"),
+    *("few-nlos", "few-nlos-false", "hard", "away-nlos-false"),
+)
 
 
 def ablation_agents() -> dict[str, tuple[float, float]]:
