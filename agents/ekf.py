@@ -36,6 +36,13 @@ class GaussianBelief(TensorClass):
     step: Int64[Tensor, "B N"]
     memory: Float[Tensor, "B N K"]
 
+    def moved(self, offset: Float[Tensor, "B N d"]) -> "GaussianBelief":
+        """Its position shifted by ``offset`` (m)."""
+        d = offset.shape[-1]
+        return self.replace(
+            state=torch.cat((self.state[..., :d] + offset, self.state[..., d:]), -1)
+        )
+
 
 def elapsed(process: Process, step: Int64[Tensor, "B N"]) -> Float[Tensor, "B N"]:
     """Seconds since the belief's step: none before the first observation."""
@@ -99,6 +106,12 @@ class DeadReckoning(Localizer[GaussianBelief]):
             batch_size=x.shape[:2],
         )
         return after, gaussian_estimate(self.process, x, covariance)
+
+    def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
+        return belief.state
+
+    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.moved(offset)
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         """What is remembered of measurements before the first: nothing."""

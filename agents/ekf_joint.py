@@ -91,6 +91,12 @@ class JointEkf(Localizer[GaussianBelief]):
         )
         return after, gaussian_estimate(self.process, x, self._own(p.flatten(1, 2)))
 
+    def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
+        return belief.state
+
+    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.moved(offset)
+
     def _update(
         self,
         x: Float[Tensor, "B N S"],

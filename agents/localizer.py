@@ -67,6 +67,14 @@ class Localizer(ABC, Generic[Belief]):
         localizer must then act for the whole team."""
         return False
 
+    def mean(self, belief: Belief) -> Float[Tensor, "B N S"]:
+        """The mean state of a belief, as ``agents.models.process`` lays states out."""
+        raise ValueError(f"{self.name} has no mean state")
+
+    def moved(self, belief: Belief, offset: Float[Tensor, "B N d"]) -> Belief:
+        """The belief with its position shifted by ``offset`` (m), as sure of it as before."""
+        raise ValueError(f"{self.name} cannot be corrected from outside")
+
     def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
         """A method's own figures at this step (particles, effective sample size, …)."""
         return {}

@@ -209,6 +209,16 @@ class ParticleFilter(Localizer[ParticleBelief]):
         )
         return after, estimate
 
+    def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
+        return moments(self.process, belief.particles, belief.log_weights.exp()).mean
+
+    def moved(self, belief: ParticleBelief, offset: Float[Tensor, "B N d"]) -> ParticleBelief:
+        d, offset = self.process.dim, offset.to(torch.float32)
+        particles = belief.particles
+        places = particles[..., :d] + offset.unsqueeze(-2)
+        last = torch.cat((belief.last[..., :d] + offset, belief.last[..., d:]), -1)
+        return belief.replace(particles=concat((places, particles[..., d:])), last=last)
+
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
         return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
 

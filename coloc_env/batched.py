@@ -7,11 +7,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coloc_env.observation import (
-    action_bounds,
-    action_width,
-    all_leaves,
-    state_bounds,
+from coloc_env.actions import (
+    ActionMode,
+    Leaves,
+    Pilot,
+    check,
+    make_mode,
+    observed_leaves,
+    privileged_bounds,
 )
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -24,11 +27,15 @@ class CoLocEnv(EnvBase):
 
     Keys: ``("uav", "observation", leaf)`` [B, N, F], ``("uav", "action")`` [B, N, A],
     ``("uav", "reward")`` [B, N, 1], ``("uav", "mask")`` [B, N] (UAVs that have not failed),
-    ``state`` [B, S] (privileged truth) and root ``done``, ``terminated``, ``truncated`` [B, 1]: an
-    episode ends at its horizon, by truncation; a world in which every UAV failed terminates.
+    ``state`` [B, S] (privileged truth, and the error of what actions are relative to) and root
+    ``done``, ``terminated``, ``truncated`` [B, 1]: an episode ends at its horizon, by truncation;
+    a world in which every UAV failed terminates.
 
     Row b of the first episode is the world of seed ``seed + b``, of the next one
     ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's.
+
+    ``action``: ``estimate`` (a localizer's), ``displacement``, or an ``ActionMode``; see
+    ``coloc_env.actions``.
     """
 
     def __init__(
@@ -37,6 +44,7 @@ class CoLocEnv(EnvBase):
         num_envs: int = 1,
         device: str | torch.device = "cpu",
         seed: int = 0,
+        action: str | ActionMode = "estimate",
         **overrides: Any,
     ) -> None:
         if isinstance(scenario, str):
@@ -46,6 +54,9 @@ class CoLocEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)
+        self.mode = make_mode(scenario, action)
+        self._pilot = Pilot(self.mode, self.world)
+        self._first_seed = seed
         self._sensed: Sensed | None = None
         self._set_seed(seed)
         self._make_specs()
@@ -56,9 +67,9 @@ class CoLocEnv(EnvBase):
             name: Bounded(leaf.low, leaf.high, (b, n, leaf.width), device, torch.float32)
             if leaf.high < float("inf")
             else Unbounded((b, n, leaf.width), device, torch.float32)
-            for name, leaf in all_leaves(self.scenario).items()
+            for name, leaf in observed_leaves(self.mode).items()
         }
-        low, high = (torch.tensor(x, device=device) for x in state_bounds(self.scenario))
+        low, high = (torch.tensor(x, device=device) for x in privileged_bounds(self.mode))
         self.observation_spec = Composite(
             uav=Composite(
                 observation=Composite(leaves, shape=(b, n)),
@@ -68,8 +79,8 @@ class CoLocEnv(EnvBase):
             state=Bounded(low.expand(b, -1), high.expand(b, -1), (b, len(low)), device),
             shape=(b,),
         )
-        low, high = (torch.tensor(x, device=device) for x in action_bounds(self.scenario))
-        shape = (b, n, action_width(self.scenario))
+        low, high = (torch.tensor(x, device=device) for x in self.mode.bounds)
+        shape = (b, n, self._pilot.width)
         action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
         self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
         reward = Unbounded((b, n, 1), device, torch.float32)
@@ -78,6 +89,11 @@ class CoLocEnv(EnvBase):
         self.done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(b,)
         )
+
+    def with_action(self, action: str | ActionMode) -> "CoLocEnv":
+        """The same environment, from its first episode on, in another action mode."""
+        b = self.batch_size[0]
+        return CoLocEnv(self.scenario, b, self.device, self._first_seed, action)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -91,18 +107,18 @@ class CoLocEnv(EnvBase):
         self.world.reset(self._seeds, rows)
         moved = self._seeds + self.batch_size[0]
         self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
-        return self._observe().copy()
+        return self._observe(self._pilot.reset(rows)).copy()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]
-        self.world.check(action)
-        step = self.world.step(action)
-        out = self._observe()
+        check(self.mode, action, self.batch_size[0])
+        step = self.world.step(self._pilot.estimate(action))
+        out = self._observe(self._pilot.observe())
         out["uav"].set("reward", step.reward.unsqueeze(-1))
         return out
 
-    def _observe(self) -> TensorDictBase:
-        """The current step's entries, reward aside."""
+    def _observe(self, leaves: Leaves) -> TensorDictBase:
+        """The current step's entries, reward aside; ``leaves`` are the action mode's."""
         if self.world.sensed is not self._sensed:
             self._sensed = self.world.sensed
             self._frames = self._window(self._sensed).unbind(1)
@@ -111,6 +127,9 @@ class CoLocEnv(EnvBase):
         messages, heard = self.world.messages()
         observation.set("messages", messages)
         observation.set("message_mask", heard)
+        for name, leaf in leaves.items():
+            observation.set(name, leaf)
+        out.set("state", self._pilot.state())
         return out
 
     def _window(self, sensed: Sensed) -> TensorDict:
@@ -126,7 +145,6 @@ class CoLocEnv(EnvBase):
         return TensorDict(
             {
                 "uav": uav,
-                "state": sensed.states,
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,

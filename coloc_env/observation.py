@@ -97,12 +97,12 @@ def all_leaves(scenario: Scenario) -> dict[str, Leaf]:
     return sensed_leaves(scenario) | message_leaves(scenario) | static_leaves(scenario)
 
 
-def observation_space(scenario: Scenario) -> gym.spaces.Dict:
+def observation_space(leaves: Mapping[str, Leaf]) -> gym.spaces.Dict:
     """One UAV's observation: a Dict of 1-D float32 Boxes."""
     return gym.spaces.Dict(
         {
             name: gym.spaces.Box(leaf.low, leaf.high, (leaf.width,), np.float32)
-            for name, leaf in all_leaves(scenario).items()
+            for name, leaf in leaves.items()
         }
     )
 
@@ -122,12 +122,6 @@ def action_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
     return low + [-50.0] * dim + [-10.0] * dim, high + [50.0] * dim + [10.0] * dim
 
 
-def action_space(scenario: Scenario) -> gym.spaces.Box:
-    """One UAV's action ``[position, velocity, log-std]``."""
-    low, high = action_bounds(scenario)
-    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
-
-
 def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
     """Bounds of the privileged truth: per UAV position, velocity, attitude, alive, scored."""
     arena = scenario.arena
@@ -140,10 +134,10 @@ def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
     return low * arena.n_uavs, high * arena.n_uavs
 
 
-def state_space(scenario: Scenario) -> gym.spaces.Box:
-    """The privileged truth of the whole team, flat and bounded."""
-    low, high = state_bounds(scenario)
-    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
+def box(bounds: tuple[list[float], list[float]]) -> gym.spaces.Box:
+    """A flat float32 Box of lowest and highest numbers."""
+    low, high = (np.array(x, np.float32) for x in bounds)
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def stack(observations: Iterable[Mapping[str, np.ndarray]]) -> Observation:

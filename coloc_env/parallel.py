@@ -10,7 +10,15 @@ import torch
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
-from coloc_env.observation import action_space, all_leaves, observation_space, state_space
+from coloc_env.actions import (
+    ActionMode,
+    Leaves,
+    Pilot,
+    make_mode,
+    observed_leaves,
+    privileged_bounds,
+)
+from coloc_env.observation import all_leaves, box, observation_space
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -30,6 +38,9 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     the state at the very step observed; its reward −‖p̂ − p‖ by default. The horizon truncates; a
     failed UAV terminates. Infos are flat and numeric: ``error`` of the step just scored (m),
     ``scored``, and the episode's ``episode_rmse``, ``episode_mean``, ``episode_max`` so far.
+
+    That is ``action="estimate"``. For learners: ``action="displacement"``, or any ``ActionMode``
+    (``coloc_env.actions``), with an action of its own and more leaves.
     """
 
     metadata = {  # noqa: RUF012 (PettingZoo's own convention)
@@ -38,7 +49,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         "is_parallelizable": True,
     }
 
-    def __init__(self, scenario: Scenario, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        render_mode: str | None = None,
+        action: str | ActionMode = "estimate",
+    ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(
                 f"render_mode={render_mode!r} is not allowed: None, {', '.join(RENDER_MODES)}"
@@ -51,11 +67,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.possible_agents = scenario.agents
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
-        space, actions = observation_space(scenario), action_space(scenario)
+        self.mode = make_mode(scenario, action)
+        self._pilot = Pilot(self.mode, self.world)
+        space, actions = observation_space(observed_leaves(self.mode)), box(self.mode.bounds)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
-        self.state_space = state_space(scenario)
-        self._width = actions.shape[0]
+        self.state_space = box(privileged_bounds(self.mode))
         self._next_seed: int | None = None
         self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
@@ -69,6 +86,10 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def action_space(self, agent: str) -> gym.spaces.Box:
         """The same space object for every agent and call."""
         return self.action_spaces[agent]
+
+    def with_action(self, action: str | ActionMode) -> "CoLocParallelEnv":
+        """The same environment in another action mode."""
+        return CoLocParallelEnv(self.scenario, self.render_mode, action)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -85,7 +106,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._static = [list(leaf[0].numpy().copy()) for leaf in self.world.static.values()]
         if self._renderer is not None:
             self._renderer.reset()
-        return self._observe(), {a: tally.info(0.0, False) for a, tally in self._tallies.items()}
+        infos = {agent: tally.info(0.0, False) for agent, tally in self._tallies.items()}
+        return self._observe(self._pilot.reset()), infos
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -104,12 +126,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if not self.agents:
             raise ValueError(f"{self.scenario.name}: the episode is over; call reset() first")
         acting, world = self.agents, self.world
-        estimates = self._estimates_of(actions)
+        estimates = self._pilot.estimate(self._actions_of(actions))
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         scored = self._of(self._window.scored[world.cursor])
         step = world.step(estimates)
-        observations = self._observe()
+        observations = self._observe(self._pilot.observe())
         errors, rewards = self._of(step.error.tolist()[0]), self._of(step.reward.tolist()[0])
         infos = {a: self._tallies[a].add(errors[a], scored[a]) for a in acting}
         over = self._window.over[world.cursor]
@@ -125,9 +147,10 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         return observations, rewards, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
-        """Privileged truth: per UAV position, velocity, attitude, alive, scored."""
+        """Privileged truth: per UAV position, velocity, attitude, alive, scored; then the errors of
+        what actions are relative to, if they are."""
         self._started()
-        return self.world.state().numpy()[0]
+        return self._pilot.state().numpy()[0]
 
     def render(self) -> np.ndarray | None:
         """The scene now: an RGB array [H, W, 3] uint8, or a window (``human``)."""
@@ -147,7 +170,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self.world.cursor < 0:
             raise ValueError(f"{self.scenario.name}: call reset() first")
 
-    def _estimates_of(self, actions: Mapping[str, np.ndarray]) -> torch.Tensor:
+    def _actions_of(self, actions: Mapping[str, np.ndarray]) -> torch.Tensor:
         """Actions as one tensor [1, N, A]; a failed UAV's slot is zero."""
         agents, count = self.agents, len(self.possible_agents)
         if not (actions.keys() >= set(agents) and actions.keys() <= self._index.keys()):
@@ -159,24 +182,27 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             stacked = np.array([[actions[a] for a in agents]], dtype=np.float32)
         except (TypeError, ValueError):
             raise self._wrong(actions) from None
-        fits = stacked.shape == (1, len(agents), self._width)
+        fits = stacked.shape == (1, len(agents), self._pilot.width)
         if not fits or np.count_nonzero(np.isfinite(stacked)) < stacked.size:
             raise self._wrong(actions)
         if len(agents) < count:
-            acting, stacked = stacked, np.zeros((1, count, self._width), np.float32)
+            acting, stacked = stacked, np.zeros((1, count, self._pilot.width), np.float32)
             stacked[0, [self._index[a] for a in agents]] = acting[0]
         return torch.from_numpy(stacked)
 
     def _wrong(self, actions: Mapping[str, np.ndarray]) -> ValueError:
         """The error that names the first action that does not fit, and what does."""
-        needed = f"({self._width},) finite numbers are needed: [position, velocity, log-std]"
+        needed = (
+            f"({self._pilot.width},) finite numbers are needed with action={self.mode.name}: "
+            f"{self.mode.meaning}"
+        )
         for agent in self.agents:
             what = f"{self.scenario.name}: the action of {agent}"
             try:
                 action = np.asarray(actions[agent], dtype=np.float32)
             except (TypeError, ValueError):
                 return ValueError(f"{what} is not numeric; {needed}")
-            if action.shape != (self._width,):
+            if action.shape != (self._pilot.width,):
                 return ValueError(f"{what} has shape {action.shape}; {needed}")
             if not np.isfinite(action).all():
                 return ValueError(f"{what} holds NaN or infinity; {needed}")
@@ -188,15 +214,18 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             return dict(zip(self.agents, every, strict=True))
         return {agent: every[self._index[agent]] for agent in self.agents}
 
-    def _observe(self) -> dict[str, dict[str, np.ndarray]]:
-        """Each agent's leaves: views of a window that the world never writes to again."""
+    def _observe(self, leaves: Leaves) -> dict[str, dict[str, np.ndarray]]:
+        """Each agent's leaves, ``leaves`` of the action mode included: views of a window that the
+        world never writes to again."""
         world = self.world
         if world.sensed is not self._window.sensed:
             self._window = _Window(world.sensed)
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]
-        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *self._static, strict=True)
-        return self._of([dict(zip(self._names, row, strict=True)) for row in rows])
+        more = [leaf.numpy()[0] for leaf in leaves.values()]
+        names = (*self._names, *leaves)
+        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *self._static, *more, strict=True)
+        return self._of([dict(zip(names, row, strict=True)) for row in rows])
 
 
 class _Window:
@@ -236,18 +265,24 @@ class _Tally:
 
 
 def parallel_env(
-    scenario: str | Scenario = "indoor-v0", render_mode: str | None = None, **overrides: Any
+    scenario: str | Scenario = "indoor-v0",
+    render_mode: str | None = None,
+    action: str | ActionMode = "estimate",
+    **overrides: Any,
 ) -> CoLocParallelEnv:
     """The environment of a scenario id with overrides, or of a Scenario."""
-    if isinstance(scenario, Scenario):
-        if overrides:
-            raise ValueError("overrides go with a scenario's id, not with a built Scenario")
-        return CoLocParallelEnv(scenario, render_mode)
-    return CoLocParallelEnv(make_scenario(scenario, **overrides), render_mode)
+    if isinstance(scenario, str):
+        scenario = make_scenario(scenario, **overrides)
+    elif overrides:
+        raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+    return CoLocParallelEnv(scenario, render_mode, action)
 
 
 def env(
-    scenario: str | Scenario = "indoor-v0", render_mode: str | None = None, **overrides: Any
+    scenario: str | Scenario = "indoor-v0",
+    render_mode: str | None = None,
+    action: str | ActionMode = "estimate",
+    **overrides: Any,
 ) -> AECEnv:
     """The same environment in PettingZoo's agent-environment-cycle form."""
-    return parallel_to_aec(parallel_env(scenario, render_mode, **overrides))
+    return parallel_to_aec(parallel_env(scenario, render_mode, action, **overrides))

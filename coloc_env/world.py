@@ -272,19 +272,3 @@ class World:
                 **self.static,
             }
         )
-
-    def check(self, estimates: Tensor) -> None:
-        """Raise a ValueError for estimates of a wrong shape or with values that are not finite."""
-        shape = (self.batch_size, self.scenario.arena.n_uavs, self._width)
-        if tuple(estimates.shape) != shape:
-            raise ValueError(
-                f"{self.scenario.name}: actions of shape {tuple(estimates.shape)} do not fit: "
-                f"{shape} (worlds, UAVs, [position, velocity, log-std]) is needed"
-            )
-        finite = estimates.isfinite()
-        if not bool(finite.all()):
-            row, uav, _ = (~finite).nonzero()[0].tolist()
-            raise ValueError(
-                f"{self.scenario.name}: the action of uav_{uav} in world {row} holds NaN or "
-                "infinity; every number must be finite"
-            )

@@ -1,11 +1,12 @@
 """The seam every sensor sits on: one file per modality, no change to World, faces or localizers."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -72,6 +73,23 @@ class Sensor(ABC):
     def delay(self) -> int:
         """Steps between sensing and delivery."""
         return 0
+
+    @property
+    def fix_slots(self) -> int:
+        """How many of its measurements, with an attitude, imply the UAV's position."""
+        return 0
+
+    def fixes(
+        self, leaves: Mapping[str, Float32[Tensor, "B N F"]], attitude: Float32[Tensor, "B N a"]
+    ) -> tuple[Float32[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
+        """Those positions (m, world frame) and which were measured."""
+        raise NotImplementedError
+
+    def turn_rate(
+        self, leaves: Mapping[str, Float32[Tensor, "B N F"]]
+    ) -> Float32[Tensor, "B N t"] | None:
+        """Turn over the step that ends now (rad/s, body frame), if that is what it measures."""
+        return None
 
     @abstractmethod
     def leaves(self, layout: Layout) -> dict[str, Leaf]:

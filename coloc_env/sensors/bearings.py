@@ -1,9 +1,10 @@
 """Range and bearing in the plane: to landmarks, and to other robots that a camera identifies."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -44,6 +45,19 @@ class LandmarkBearings(Sensor):
             self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)"
         )
         require(0 <= self.share <= 1, self, "share", "a probability in [0, 1]")
+
+    @property
+    def fix_slots(self) -> int:
+        return self.depth * self.count
+
+    def fixes(
+        self, leaves: Mapping[str, Float32[Tensor, "B N F"]], attitude: Float32[Tensor, "B N a"]
+    ) -> tuple[Float32[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
+        distance, bearing = leaves["landmark_bearings"].unflatten(-1, (-1, 2)).unbind(-1)
+        heading = attitude + bearing
+        apart = distance.unsqueeze(-1) * torch.stack((heading.cos(), heading.sin()), -1)
+        points = leaves["landmark_map"].unflatten(-1, (-1, 2)).repeat(1, 1, self.depth, 1)
+        return points - apart, leaves["landmark_bearing_mask"] > 0
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 2, "LandmarkBearings", "dim", "bearings need a 2-D scenario")

@@ -1,9 +1,10 @@
 """Inertial measurement unit: specific force and angular rate in the body frame."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -45,6 +46,9 @@ class Imu(Sensor):
         scale = torch.tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3, device=keys.device)
         bias = noise.normal(keys, "imu.bias", 6 * layout.arena.n_uavs)
         return {"bias": bias.unflatten(-1, (-1, 6)) * scale}
+
+    def turn_rate(self, leaves: Mapping[str, Float32[Tensor, "B N F"]]) -> Float32[Tensor, "B N t"]:
+        return leaves["imu"][..., 3:]
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         now, before, dt = window.motion, window.before, window.layout.arena.dt

@@ -1,13 +1,14 @@
 """Landmarks at known positions, seen as relative position vectors in the body frame."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.geometry import rotation_matrix
+from coloc_env.geometry import rotate, rotation_matrix
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
 
 
@@ -51,6 +52,17 @@ class Landmarks(Sensor):
             "off",
             "(from, to) in s, from ≤ to",
         )
+
+    @property
+    def fix_slots(self) -> int:
+        return self.count
+
+    def fixes(
+        self, leaves: Mapping[str, Float32[Tensor, "B N F"]], attitude: Float32[Tensor, "B N a"]
+    ) -> tuple[Float32[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
+        shape = (self.count, -1)
+        apart = rotate(attitude.unsqueeze(-2), leaves["landmarks"].unflatten(-1, shape))
+        return leaves["landmark_map"].unflatten(-1, shape) - apart, leaves["landmark_mask"] > 0
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return {

@@ -1,8 +1,10 @@
 """Wheel odometry of a ground robot in the plane."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float32
 from torch import Tensor
 
 from coloc_env import noise
@@ -38,6 +40,9 @@ class Odometry(Sensor):
         size = odometry.abs()
         speed = size[..., :1]
         return base + self.relative * torch.cat((speed, speed, size[..., 2:]), -1)
+
+    def turn_rate(self, leaves: Mapping[str, Float32[Tensor, "B N F"]]) -> Float32[Tensor, "B N t"]:
+        return leaves["odometry"][..., 2:]
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         now, before, dt = window.motion, window.before, window.layout.arena.dt
