@@ -28,6 +28,7 @@ class Learned(nn.Module):
 
     kind: ClassVar[str]
     features: ClassVar[tuple[str, ...]]
+    architecture: Mapping[str, Any] = {}
 
 
 _L = TypeVar("_L", bound=Learned)
@@ -46,6 +47,11 @@ def learned(kind: type[_L], weights: str, seed: int = 0) -> _L:
     if weights != "none":
         load(weights, module)
     return module
+
+
+def card_of(source: str | Path) -> dict[str, Any]:
+    """A checkpoint's card, without looking at its weights; ValueError as ``load`` raises it."""
+    return _card(_find(source)[1])
 
 
 def load(source: str | Path, module: Learned) -> dict[str, Any]:

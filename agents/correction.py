@@ -17,7 +17,7 @@ from agents.residuals import pulls, robust_statistics
 from coloc_env.actions import ActionMode, Leaves
 from coloc_env.fixes import fix_leaves, relative_fixes
 from coloc_env.observation import Observation
-from coloc_env.scenario import Scenario
+from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
 
 MOST = 1.0  # m: no correction is larger
@@ -50,18 +50,17 @@ class Correction(ActionMode):
     name = "correction"
     meaning = "correction in units of what the base may be off, within [-1, 1]"
 
-    def __init__(self, scenario: Scenario, base: str = "ekf", feedback: float = 0.0) -> None:
-        super().__init__(scenario)
+    def __init__(self, believed: Believed, base: str = "ekf", feedback: float = 0.0) -> None:
+        super().__init__(believed)
         if not 0 <= feedback <= 1:
             raise ValueError(f"feedback={feedback} is not allowed: a share in [0, 1]")
-        self.base: Localizer[Any] = make(base, scenario)
+        self.base: Localizer[Any] = make(base, believed)
+        self._base = base
         self.feedback = feedback
-        self.believed = scenario.believed
-        self.dim = scenario.arena.dim
-        self.process = make_process(self.believed)
-        models = make_measurements(self.believed)
+        self.process = make_process(believed)
+        models = make_measurements(believed)
         self.models = [model for model in models if isinstance(model, _PULLS)]
-        fixes = fix_leaves(self.believed)
+        fixes = fix_leaves(believed)
         self._fixes = fixes if self.process.attitude_error is not None else {}
         mean = ("fix_mean",) if self._fixes else ()
         self.features = ("base_std", *mean, "residuals", "last_action")
@@ -69,6 +68,10 @@ class Correction(ActionMode):
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
         return [-1.0] * self.dim, [1.0] * self.dim
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"name": self.name, "base": self._base, "feedback": self.feedback}
 
     @property
     def leaves(self) -> dict[str, Leaf]:
@@ -157,5 +160,5 @@ def with_base(env: Env, base: str = "ekf", feedback: float = 0.0) -> Env:
 
     Raises ValueError for a base that is unknown, does not serve the scenario, or has no state.
     """
-    corrected: Env = env.with_action(Correction(env.scenario, base, feedback))
+    corrected: Env = env.with_action(Correction(env.scenario.believed, base, feedback))
     return corrected

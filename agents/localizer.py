@@ -102,8 +102,8 @@ def options_of(name: str) -> dict[str, inspect.Parameter]:
     return options.parameters(LOCALIZERS[name])
 
 
-def make(name: str, scenario: Scenario, **chosen: Any) -> Localizer:
-    """Build a localizer for what the scenario's team believes.
+def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
+    """Build a localizer for what the scenario's team believes (or for those beliefs).
 
     ``name`` may carry options as on the command line (``"ekf:robust=huber"``). Raises ValueError,
     in one line that names what is allowed, for an unknown name or option.
@@ -116,8 +116,9 @@ def make(name: str, scenario: Scenario, **chosen: Any) -> Localizer:
             raise ValueError(f"{name}: {key} is given twice")
         chosen[key] = value
     options.check(name, chosen, known)
+    believed = scenario.believed if isinstance(scenario, Scenario) else scenario
     try:
-        return LOCALIZERS[name](scenario.believed, **chosen)
+        return LOCALIZERS[name](believed, **chosen)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from coloc_env.observation import Observation, action_bounds, all_leaves, state_bounds
-from coloc_env.scenario import Scenario
+from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
 from coloc_env.world import World
 
@@ -22,7 +22,7 @@ FARTHEST = 100.0  # m: errors beyond are cut in the privileged state, whose boun
 
 
 class ActionMode(ABC):
-    """What an action is in a scenario: pure functions of a memory, batch (B, N).
+    """What an action is, to a team with some beliefs: pure functions of a memory, batch (B, N).
 
     A memory is a tensorclass of batch (B, N) that holds all there is from step to step (None if
     there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
@@ -34,13 +34,19 @@ class ActionMode(ABC):
     meaning: ClassVar[str]
     features: tuple[str, ...] = ()
 
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
+    def __init__(self, believed: Believed) -> None:
+        self.believed = believed
+        self.dim = believed.arena.dim
 
     @property
     @abstractmethod
     def bounds(self) -> tuple[list[float], list[float]]:
         """Lowest and highest numbers of one UAV's action."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What describes it, beside the beliefs."""
+        return {"name": self.name}
 
     @property
     def leaves(self) -> dict[str, Leaf]:
@@ -75,7 +81,7 @@ class Estimates(ActionMode):
 
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
-        return action_bounds(self.scenario)
+        return action_bounds(self.believed.arena)
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
@@ -138,32 +144,31 @@ def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
     from coloc_env.displacement import Displacement
 
     if isinstance(action, ActionMode):
-        if action.scenario is not scenario:
+        if action.believed is not scenario.believed:
             raise ValueError(f"{scenario.name}: the action mode was made for another scenario")
         return action
     modes: dict[str, type[ActionMode]] = {m.name: m for m in (Estimates, Displacement)}
     if action not in modes:
         raise ValueError(f"action={action!r} is not allowed: {', '.join(modes)}, or an ActionMode")
-    return modes[action](scenario)
+    return modes[action](scenario.believed)
 
 
-def observed_leaves(mode: ActionMode) -> dict[str, Leaf]:
+def observed_leaves(scenario: Scenario, mode: ActionMode) -> dict[str, Leaf]:
     """Every leaf of an observation in this mode, in the order of the spaces."""
-    return all_leaves(mode.scenario) | mode.leaves
+    return all_leaves(scenario) | mode.leaves
 
 
-def privileged_bounds(mode: ActionMode) -> tuple[list[float], list[float]]:
+def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:
     """Bounds of the flat state: the truth's, and those of the error that goes with the mode."""
-    low, high = state_bounds(mode.scenario)
+    low, high = state_bounds(scenario)
     if type(mode).reference is not ActionMode.reference:
-        more = mode.scenario.arena.n_uavs * mode.scenario.arena.dim
+        more = scenario.arena.n_uavs * mode.dim
         low, high = low + [-FARTHEST] * more, high + [FARTHEST] * more
     return low, high
 
 
-def check(mode: ActionMode, actions: Tensor, worlds: int) -> None:
+def check(scenario: Scenario, mode: ActionMode, actions: Tensor, worlds: int) -> None:
     """Raise a ValueError for actions of a wrong shape or with values that are not finite."""
-    scenario = mode.scenario
     shape = (worlds, scenario.arena.n_uavs, len(mode.bounds[0]))
     if tuple(actions.shape) != shape:
         raise ValueError(

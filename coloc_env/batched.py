@@ -67,9 +67,11 @@ class CoLocEnv(EnvBase):
             name: Bounded(leaf.low, leaf.high, (b, n, leaf.width), device, torch.float32)
             if leaf.high < float("inf")
             else Unbounded((b, n, leaf.width), device, torch.float32)
-            for name, leaf in observed_leaves(self.mode).items()
+            for name, leaf in observed_leaves(self.scenario, self.mode).items()
         }
-        low, high = (torch.tensor(x, device=device) for x in privileged_bounds(self.mode))
+        low, high = (
+            torch.tensor(x, device=device) for x in privileged_bounds(self.scenario, self.mode)
+        )
         self.observation_spec = Composite(
             uav=Composite(
                 observation=Composite(leaves, shape=(b, n)),
@@ -111,7 +113,7 @@ class CoLocEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]
-        check(self.mode, action, self.batch_size[0])
+        check(self.scenario, self.mode, action, self.batch_size[0])
         step = self.world.step(self._pilot.estimate(action))
         out = self._observe(self._pilot.observe())
         out["uav"].set("reward", step.reward.unsqueeze(-1))

@@ -8,7 +8,7 @@ from torch import Tensor
 from coloc_env.actions import ActionMode, Leaves
 from coloc_env.fixes import fix_leaves, relative_fixes, turned
 from coloc_env.observation import Observation
-from coloc_env.scenario import Scenario
+from coloc_env.scenario import Believed
 from coloc_env.sensors.base import Leaf
 
 REACH = 1.0  # m: how far an action of 1 moves the estimate
@@ -36,10 +36,8 @@ class Displacement(ActionMode):
     name = "displacement"
     meaning = "displacement in m within [-1, 1]"
 
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__(scenario)
-        self.believed = scenario.believed
-        self.dim = scenario.arena.dim
+    def __init__(self, believed: Believed) -> None:
+        super().__init__(believed)
         self._fixes = fix_leaves(self.believed)
         self.features = (
             *(name for name in ("fix_mean", "fix_share") if self._fixes),

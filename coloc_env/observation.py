@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from coloc_env.motion import Arena
 from coloc_env.scenario import Scenario
 from coloc_env.sensors.base import MASK, Leaf
 
@@ -107,13 +108,12 @@ def observation_space(leaves: Mapping[str, Leaf]) -> gym.spaces.Dict:
     )
 
 
-def action_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:
+def action_bounds(arena: Arena) -> tuple[list[float], list[float]]:
     """Bounds of the flat action: twice the arena's extent, ±50 m/s, log-std within ±10.
 
     They describe where sensible estimates lie (and what samples look like); a finite estimate
     beyond them is scored, not refused.
     """
-    arena = scenario.arena
     low, high = [], []
     for a, b in zip(arena.low, arena.high, strict=True):
         low.append(a - 0.5 * (b - a))

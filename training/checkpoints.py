@@ -22,6 +22,7 @@ def write(weights: Path, module: Learned, trained: Mapping[str, Any]) -> None:
     card = {
         "kind": module.kind,
         "features": list(module.features),
+        **({"architecture": module.architecture} if module.architecture else {}),
         "sha256": hashlib.sha256(data).hexdigest(),
         **trained,
     }

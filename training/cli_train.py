@@ -63,7 +63,8 @@ def train(
 
     torch.set_num_threads(threads)
     from coloc_env.options import parse
-    from training import pfnn as _pfnn  # noqa: F401  (registers its training)
+    from training import mappo as _mappo  # noqa: F401  (registers its trainings)
+    from training import pfnn as _pfnn  # noqa: F401
     from training import runs
     from training import trust as _trust  # noqa: F401
 

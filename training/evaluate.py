@@ -16,7 +16,7 @@ from training.results import AgentResult, Results
 
 Progress = Callable[[str, int, int], None]
 
-_MEMORY = 2**30  # bytes that a batch's beliefs and what is made of them in a step may take
+_FAST = 2**25  # bytes of a batch's beliefs and what is made of them in a step: more fits no cache
 _WORKING_SET = 20  # bytes in use at the height of a step per byte of belief
 _TIMED, _WARM_UP = 50, 5  # steps
 
@@ -36,7 +36,7 @@ def evaluate(
 
     ``progress(what, done, total)`` is called as work is done. ``bound``: compute the posterior
     bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
-    memory allows); no result depends on it, a localizer's own rounding aside.
+    are fast); no result depends on it, a localizer's own rounding aside.
 
     A run in which an agent says NaN or infinity, or raises a numerical error, goes on with the last
     finite estimates (the prior before the first) and counts as diverged.
@@ -117,7 +117,7 @@ def _runs(
     chunk: int | None,
     tell: Progress,
 ) -> Tape:
-    """All runs of one agent, as many at once as memory allows."""
+    """All runs of one agent, as many at once as are fast together."""
     at_once = chunk or _runs_at_once(localizer, scenario)
     done, total = 0, runs * scenario.horizon
 
@@ -134,12 +134,12 @@ def _runs(
 
 
 def _runs_at_once(localizer: Localizer, scenario: Scenario) -> int:
-    """How many runs fit in memory, from the size of one run's belief."""
+    """How many runs are fastest together, from the size of one run's belief."""
     try:
         size = localizer.reset(World(scenario, window=1).reset(0)).bytes()
     except NUMERICAL:
         return 1
-    return max(1, _MEMORY // (_WORKING_SET * max(1, size)))
+    return max(1, _FAST // (_WORKING_SET * max(1, size)))
 
 
 @torch.no_grad()

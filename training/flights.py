@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from agents.policy import LocalizerPolicy
 from coloc_env.batched import CoLocEnv
-from coloc_env.scenario import Scenario
+from coloc_env.per_uav import PerUavEnv
 
 _TRAINING_WORLDS = 1 << 40  # far from the seeds that anyone evaluates with
 _PER_SEED = 1 << 24  # worlds that one training may fly
@@ -59,17 +59,18 @@ class Flights:
 
 
 def fly(
-    scenario: Scenario, policy: LocalizerPolicy, worlds: int, seed: int, steps: int
+    env: CoLocEnv | PerUavEnv, policy: TensorDictModuleBase, steps: int, **options: Any
 ) -> Collector:
-    """A Collector for one flight of the worlds seeded ``seed`` …, from their start to the horizon
-    (to the last whole batch before it), in batches of ``steps`` steps."""
+    """A Collector for one flight of an environment's worlds, from their start to the horizon (to
+    the last whole batch before it), in batches of ``steps`` steps; ``options`` are its own."""
+    rows = env.batch_size.numel()
     return Collector(
-        CoLocEnv(scenario, worlds, seed=seed),
+        env,
         policy,
-        frames_per_batch=worlds * steps,
-        total_frames=worlds * (scenario.horizon // steps) * steps,
+        frames_per_batch=rows * steps,
+        total_frames=rows * (env.scenario.horizon // steps) * steps,
         auto_register_policy_transforms=True,
-        compact_obs=True,  # ("next", "uav", "observation") is the next step's; half the memory
+        **options,
     )
 
 

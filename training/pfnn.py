@@ -21,6 +21,7 @@ from agents.particles import population
 from agents.particles.cloud import select
 from agents.policy import LocalizerPolicy
 from coloc_env import noise
+from coloc_env.batched import CoLocEnv
 from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flight, Flights, fly, world_seed
@@ -146,7 +147,8 @@ def pfnn(
 
     def launch(epoch: int) -> Flight:
         policy = LocalizerPolicy(localizer, scene, record=Samples(scene))
-        return fly(scene, policy, worlds, world_seed(seed, epoch, worlds), steps)
+        env = CoLocEnv(scene, worlds, seed=world_seed(seed, epoch, worlds))
+        return fly(env, policy, steps, compact_obs=True)
 
     flights = Flights(launch, epochs)
     if mode == "online":

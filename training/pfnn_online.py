@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from agents import make
 from agents.policy import LocalizerPolicy
+from coloc_env.batched import CoLocEnv
 from coloc_env.scenario import Scenario
 from training.flights import Flight, Flights, fly
 from training.pfnn import EVERY, LEARNING_RATE, CorrectorLoss, InTurn, Samples, samples_of
@@ -65,7 +66,7 @@ def learn_in_flight(
 
     def launch(epoch: int) -> Flight:
         policy = LocalizerPolicy(localizer, scenario, record=Samples(scenario))
-        return fly(scenario, policy, runs, seed, EVERY)
+        return fly(CoLocEnv(scenario, runs, seed=seed), policy, EVERY, compact_obs=True)
 
     errors, counts, losses = [], [], []
 

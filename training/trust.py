@@ -17,6 +17,7 @@ from agents.checkpoint import untrained
 from agents.ekf import CooperativeEkf, GaussianBelief
 from agents.policy import LocalizerPolicy
 from agents.trust import TrustNetwork
+from coloc_env.batched import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
 from training import metrics
@@ -165,18 +166,13 @@ def trust(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * share
         first = world_seed(seed, epoch, worlds * len(scenes))
-        return Fleet(
-            [
-                fly(
-                    scene,
-                    LocalizerPolicy(ekf, scene, record=partial(_record, i)),
-                    worlds,
-                    first + i * worlds,
-                    steps,
-                )
-                for i, (ekf, scene) in enumerate(zip(filters, scenes, strict=True))
-            ]
-        )
+        collectors = []
+        for i, (ekf, scene) in enumerate(zip(filters, scenes, strict=True)):
+            env = CoLocEnv(scene, worlds, seed=first + i * worlds)
+            policy = LocalizerPolicy(ekf, scene, record=partial(_record, i))
+            # ("next", "uav", "observation") is the next step's: half the memory.
+            collectors.append(fly(env, policy, steps, compact_obs=True))
+        return Fleet(collectors)
 
     flights = Flights(launch, epochs)
     trainer = make_trainer(flights, loss, optimizer, clip_norm=1.0)

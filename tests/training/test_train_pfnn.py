@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from agents import make
 from agents.corrector import WeightCorrector
 from agents.policy import LocalizerPolicy
+from coloc_env.batched import CoLocEnv
 from coloc_env.scenarios import make_scenario
 from training import pfnn_online, runs
 from training.flights import fly, world_seed
@@ -83,7 +84,7 @@ def test_samples() -> None:
             return super().__call__(before, after, tensordict)
 
     policy = LocalizerPolicy(localizer, scenario, record=Watched(scenario))
-    (batch,) = fly(scenario, policy, 3, 5, 20)
+    (batch,) = fly(CoLocEnv(scenario, 3, seed=5), policy, 20, compact_obs=True)
     flown = seen[-20:]
     train = batch["train"]
     assert train["features"].shape == (3, 20, 2, 50, 6)

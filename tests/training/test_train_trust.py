@@ -17,6 +17,7 @@ from agents.checkpoint import load
 from agents.policy import LocalizerPolicy
 from agents.trust import TrustNetwork, TrustScreen
 from agents.trust import screen as trust_screen
+from coloc_env.batched import CoLocEnv
 from coloc_env.scenarios import make_scenario
 from training import runs
 from training import trust as training
@@ -85,7 +86,7 @@ def recorded() -> SimpleNamespace:
     ekf: Any = make("ekf_trust", scene, weights="none")
     ekf.learn(network)
     policy = LocalizerPolicy(ekf, scene, record=partial(training._record, 0))
-    batches = list(fly(scene, policy, 2, 5, 3))
+    batches = list(fly(CoLocEnv(scene, 2, seed=5), policy, 3, compact_obs=True))
     return SimpleNamespace(scene=scene, network=network, ekf=ekf, batch=batches[1].clone())
 
 
