@@ -140,11 +140,11 @@ class Ippo(PolicyAgent):
         super().__init__(believed, weights=weights)
 
 
-@register("sb3_ppo")
+@register("sb3-ppo")
 class Sb3Ppo(PolicyAgent):
     """A policy trained by ``coloc train sb3-ppo``. ``weights``: a checkpoint's name or path."""
 
-    name = "sb3_ppo"
+    name = "sb3-ppo"
 
-    def __init__(self, believed: Believed, *, weights: str = "sb3_ppo") -> None:
+    def __init__(self, believed: Believed, *, weights: str = "sb3-ppo") -> None:
         super().__init__(believed, weights=weights)

@@ -15,12 +15,25 @@ from coloc_env.scenarios import FAMILIES, make_scenario
 if TYPE_CHECKING:
     from coloc_env.batched import CoLocEnv
     from coloc_env.parallel import env, parallel_env
+    from coloc_env.per_uav import PerUavEnv
+    from coloc_env.vec_env import CoLocVecEnv
     from coloc_env.world import World
 
-__all__ = ["CoLocEnv", "Scenario", "World", "env", "make_scenario", "parallel_env"]
+__all__ = [
+    "CoLocEnv",
+    "CoLocVecEnv",
+    "PerUavEnv",
+    "Scenario",
+    "World",
+    "env",
+    "make_scenario",
+    "parallel_env",
+]
 
 _HOMES = {  # loaded when asked for: TorchRL takes a second that PettingZoo's users need not wait
     "CoLocEnv": "coloc_env.batched",
+    "CoLocVecEnv": "coloc_env.vec_env",
+    "PerUavEnv": "coloc_env.per_uav",
     "World": "coloc_env.world",
     "env": "coloc_env.parallel",
     "parallel_env": "coloc_env.parallel",

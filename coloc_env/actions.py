@@ -6,6 +6,7 @@ localizer (``agents.with_base``).
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -141,21 +142,38 @@ class Pilot:
 def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
     """A mode by name (``estimate``, ``displacement``), or the one given. ValueError for another
     name, or for a mode that was made for another scenario."""
-    from coloc_env.displacement import Displacement
-
     if isinstance(action, ActionMode):
         if action.believed is not scenario.believed:
             raise ValueError(f"{scenario.name}: the action mode was made for another scenario")
         return action
-    modes: dict[str, type[ActionMode]] = {m.name: m for m in (Estimates, Displacement)}
-    if action not in modes:
-        raise ValueError(f"action={action!r} is not allowed: {', '.join(modes)}, or an ActionMode")
-    return modes[action](scenario.believed)
+    if action == Estimates.name:
+        return Estimates(scenario.believed)
+    if action == "displacement":
+        from coloc_env.displacement import Displacement  # takes a second that filters need not wait
+
+        return Displacement(scenario.believed)
+    raise ValueError(f"action={action!r} is not allowed: estimate, displacement, or an ActionMode")
 
 
 def observed_leaves(scenario: Scenario, mode: ActionMode) -> dict[str, Leaf]:
     """Every leaf of an observation in this mode, in the order of the spaces."""
     return all_leaves(scenario) | mode.leaves
+
+
+def chosen_leaves(
+    scenario: Scenario, mode: ActionMode, wanted: Sequence[str] | None
+) -> dict[str, Leaf]:
+    """The leaves of a flat observation: those wanted, else those that the mode recommends, else
+    all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
+    not end together."""
+    known = observed_leaves(scenario, mode)
+    names = tuple(wanted or mode.features or known)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")
+    if scenario.failure_rate or scenario.failures:
+        raise ValueError(f"{scenario.name}: UAVs that fail do not fit rows of one UAV each")
+    return {name: known[name] for name in names}
 
 
 def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coloc_env.actions import (
@@ -75,7 +75,7 @@ class CoLocEnv(EnvBase):
         self.observation_spec = Composite(
             uav=Composite(
                 observation=Composite(leaves, shape=(b, n)),
-                mask=Binary(n, (b, n), device, torch.bool),
+                mask=Categorical(2, (b, n), device, dtype=torch.bool),
                 shape=(b, n),
             ),
             state=Bounded(low.expand(b, -1), high.expand(b, -1), (b, len(low)), device),

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coloc_env.actions import observed_leaves
+from coloc_env.actions import chosen_leaves
 from coloc_env.batched import CoLocEnv
 
 
@@ -25,18 +25,12 @@ class PerUavEnv(EnvBase):
     """
 
     def __init__(self, env: CoLocEnv, leaves: Sequence[str] | None = None) -> None:
-        known = observed_leaves(env.scenario, env.mode)
-        chosen = tuple(leaves or env.mode.features or known)
-        unknown = [name for name in chosen if name not in known]
-        if unknown:
-            raise ValueError(f"there is no leaf {unknown[0]!r}; known: {', '.join(known)}")
-        if env.scenario.failure_rate or env.scenario.failures:
-            raise ValueError(f"{env.scenario.name}: UAVs that fail do not fit the flattened view")
+        chosen = chosen_leaves(env.scenario, env.mode, leaves)
         self.worlds, self.n_uavs = env.batch_size[0], env.scenario.arena.n_uavs
         rows = self.worlds * self.n_uavs
         super().__init__(device=env.device, batch_size=torch.Size([rows]))
-        self.env, self.scenario, self.mode, self.leaves = env, env.scenario, env.mode, chosen
-        width = sum(known[name].width for name in chosen)
+        self.env, self.scenario, self.mode, self.leaves = env, env.scenario, env.mode, tuple(chosen)
+        width = sum(leaf.width for leaf in chosen.values())
         states = env.observation_spec["state"].shape[-1]
         self.observation_spec = Composite(
             observation=Unbounded((rows, width), self.device, torch.float32),

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -37,17 +37,39 @@ _EVER = 1 << 62  # frames: the flights end a training, not a number of frames
 _VERSIONS = ("coloc", "torch", "torchrl", "tensordict", "safetensors", "numpy")
 
 
+class Epochs(Protocol):
+    """How far a training is, in whole epochs; ``landed`` is called after each."""
+
+    epoch: int
+    epochs: int
+    landed: Callable[[int], None]
+
+
+class Trains(Protocol):
+    """What runs ask of a trainer: TorchRL's Trainer, or one that does the same."""
+
+    logger: Any
+    collected_frames: int
+
+    def train(self) -> None: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None: ...
+
+
 @dataclass(frozen=True)
 class Training:
     """What there is to a training beside its directory.
 
     ``module`` is what learns, and is written at the end; ``trainer`` is ``make_trainer``'s over
-    ``flights``, with hooks of its own; ``score`` measures what was learned, for the card.
+    ``flights``, with hooks of its own (or both are another library's); ``score`` measures what was
+    learned, for the card.
     """
 
     module: Learned
-    flights: Flights
-    trainer: Trainer
+    flights: Epochs
+    trainer: Trains
     score: Callable[[Progress], Mapping[str, Any]]
 
 
@@ -62,8 +84,9 @@ TRAININGS: dict[str, Callable[..., Training]] = {}
 
 
 def register(factory: Callable[..., Training]) -> Callable[..., Training]:
-    """Register a training under its function's name; its keyword-only parameters are options."""
-    TRAININGS[factory.__name__] = factory
+    """Register a training under its function's name (``sb3-ppo`` for ``sb3_ppo``); its keyword-only
+    parameters are options."""
+    TRAININGS[factory.__name__.replace("_", "-")] = factory
     return factory
 
 
