@@ -17,7 +17,7 @@ from coloc_env.actions import (
     privileged_bounds,
 )
 from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import scenario_from
 from coloc_env.sense import Sensed
 from coloc_env.world import World
 
@@ -47,10 +47,7 @@ class CoLocEnv(EnvBase):
         action: str | ActionMode = "estimate",
         **overrides: Any,
     ) -> None:
-        if isinstance(scenario, str):
-            scenario = make_scenario(scenario, **overrides)
-        elif overrides:
-            raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+        scenario = scenario_from(scenario, overrides)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)

@@ -140,6 +140,13 @@ def box(bounds: tuple[list[float], list[float]]) -> gym.spaces.Box:
     return gym.spaces.Box(low, high, dtype=np.float32)
 
 
+def flat_box(leaves: Mapping[str, Leaf]) -> gym.spaces.Box:
+    """The Box of leaves side by side."""
+    low = [leaf.low for leaf in leaves.values() for _ in range(leaf.width)]
+    high = [leaf.high for leaf in leaves.values() for _ in range(leaf.width)]
+    return box((low, high))
+
+
 def stack(observations: Iterable[Mapping[str, np.ndarray]]) -> Observation:
     """Observations of the agents of one PettingZoo world as an ``Observation`` with B = 1."""
     agents = list(observations)

@@ -21,7 +21,7 @@ from coloc_env.actions import (
 from coloc_env.observation import all_leaves, box, observation_space
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import scenario_from
 from coloc_env.sense import Sensed
 from coloc_env.world import World
 
@@ -274,11 +274,7 @@ def parallel_env(
     **overrides: Any,
 ) -> CoLocParallelEnv:
     """The environment of a scenario id with overrides, or of a Scenario."""
-    if isinstance(scenario, str):
-        scenario = make_scenario(scenario, **overrides)
-    elif overrides:
-        raise ValueError("overrides go with a scenario's id, not with a built Scenario")
-    return CoLocParallelEnv(scenario, render_mode, action)
+    return CoLocParallelEnv(scenario_from(scenario, overrides), render_mode, action)
 
 
 def env(

@@ -12,10 +12,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from torch import Tensor
 
 from coloc_env.actions import ActionMode, Pilot, chosen_leaves, make_mode
-from coloc_env.observation import box
+from coloc_env.observation import box, flat_box
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import scenario_from
 from coloc_env.world import World
 
 Array = NDArray[np.float32]
@@ -62,10 +62,7 @@ class CoLocVecEnv(VecEnv):
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
-        if isinstance(scenario, str):
-            scenario = make_scenario(scenario, **overrides)
-        elif overrides:
-            raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+        scenario = scenario_from(scenario, overrides)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is not allowed: None, rgb_array")
         self.scenario, self.mode = scenario, make_mode(scenario, action)
@@ -79,10 +76,7 @@ class CoLocVecEnv(VecEnv):
         pairs = [(b, i) for b in range(num_worlds) for i in range(self.n_uavs)]
         self.slots = [Slot(self, b, i) for b, i in pairs]
         self._first_seed = self._next_seed = seed
-        low = np.concatenate([np.full(leaf.width, leaf.low) for leaf in chosen.values()])
-        high = np.concatenate([np.full(leaf.width, leaf.high) for leaf in chosen.values()])
-        space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-        super().__init__(len(self.slots), space, box(self.mode.bounds))
+        super().__init__(len(self.slots), flat_box(chosen), box(self.mode.bounds))
 
     def with_action(self, action: str | ActionMode) -> "CoLocVecEnv":
         """The same environment, from its first episode on, in another action mode."""

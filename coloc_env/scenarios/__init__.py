@@ -8,6 +8,7 @@ from coloc_env.scenarios.registry import (
     overrides_of,
     parse_override,
     register,
+    scenario_from,
 )
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "overrides_of",
     "parse_override",
     "register",
+    "scenario_from",
 ]

@@ -43,6 +43,15 @@ def make_scenario(name: str, **overrides: Any) -> Scenario:
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
 
 
+def scenario_from(scenario: str | Scenario, overrides: dict[str, Any]) -> Scenario:
+    """The scenario of an id with overrides, or the one given; ValueError for both at once."""
+    if isinstance(scenario, str):
+        return make_scenario(scenario, **overrides)
+    if overrides:
+        raise ValueError("overrides go with a scenario's id, not with a built Scenario")
+    return scenario
+
+
 def parse_override(name: str, text: str) -> tuple[str, Any]:
     """``key=value`` from a command line, the value read as the override's type."""
     return options.parse(name, text, overrides_of(name))
