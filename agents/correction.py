@@ -55,6 +55,9 @@ class Correction(ActionMode):
         if not 0 <= feedback <= 1:
             raise ValueError(f"feedback={feedback} is not allowed: a share in [0, 1]")
         self.base: Localizer[Any] = make(base, believed)
+        kind = type(self.base)
+        if kind.mean is Localizer.mean or (feedback and kind.moved is Localizer.moved):
+            raise ValueError(f"base={base!r} is not allowed: a filter, such as ekf or pf500")
         self._base = base
         self.feedback = feedback
         self.process = make_process(believed)

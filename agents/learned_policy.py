@@ -24,7 +24,10 @@ def mode_of(believed: Believed, settings: dict[str, Any]) -> ActionMode:
     kind = options.pop("name", None)
     if kind not in kinds:
         raise ValueError(f"action mode {kind!r} is not one that policies have: {', '.join(kinds)}")
-    mode: ActionMode = kinds[kind](believed, **options)
+    try:
+        mode: ActionMode = kinds[kind](believed, **options)
+    except TypeError as error:
+        raise ValueError(f"action mode {kind!r}: {error}") from None
     return mode
 
 

@@ -21,6 +21,20 @@ CARRIES = ("module", "tensordict")
 Record = Callable[[Any, Any, TensorDictBase], Mapping[str, Tensor]]
 
 
+def check_part(localizer: Localizer, count: int) -> None:
+    """Raise a ValueError if the localizer cannot act for only ``count`` UAVs of its team."""
+    believed = localizer.believed
+    if count == believed.arena.n_uavs:
+        return
+    why = ""
+    if any(getattr(sensor, "tags", ()) for sensor in believed.sensors):
+        why = "this team's UWB lever arms differ from UAV to UAV"
+    elif localizer.exchanges:
+        why = "the UAVs share what they measured"
+    if why:
+        raise ValueError(f"{localizer.name}: {why}, so one localizer must act for all of them")
+
+
 class ParallelPolicy:
     """A localizer that acts in a PettingZoo parallel environment.
 
@@ -36,7 +50,6 @@ class ParallelPolicy:
         self.agents = None if agents is None else tuple(agents)
         believed = localizer.believed
         layout = Layout(believed.arena, believed.slots)
-        self._arms_differ = any(getattr(sensor, "tags", ()) for sensor in believed.sensors)
         self._constant = {"prior"}.union(*(s.map_leaves(layout) for s in believed.sensors))
         self.reset()
 
@@ -56,17 +69,8 @@ class ParallelPolicy:
         if begins and len(present) < len(team):
             missing = next(agent for agent in team if agent not in observations)
             raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
-        partial = begins and len(team) < self.localizer.believed.arena.n_uavs
-        if partial and self._arms_differ:
-            raise ValueError(
-                f"{self.localizer.name}: this team's UWB lever arms differ from UAV to UAV, so one "
-                "localizer must act for all of them"
-            )
-        if partial and self.localizer.exchanges:
-            raise ValueError(
-                f"{self.localizer.name}: the UAVs compare what they measured, so one localizer "
-                "must act for all of them"
-            )
+        if begins:
+            check_part(self.localizer, len(team))
         if not present:
             return {}
         for agent in team:

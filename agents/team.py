@@ -9,7 +9,7 @@ import torch
 
 from agents.correction import Correction
 from agents.localizer import make
-from agents.policy import ParallelPolicy
+from agents.policy import ParallelPolicy, check_part
 from coloc_env.actions import ActionMode, chosen_leaves, make_mode
 from coloc_env.observation import box, flat_box, stack
 from coloc_env.parallel import CoLocParallelEnv
@@ -35,6 +35,8 @@ class Team:
             ParallelPolicy(make(method, scenario), [u for u in methods if methods[u] == method])
             for method in dict.fromkeys(methods.values())
         ]
+        for policy in self.policies:
+            check_part(policy.localizer, len(policy.agents or known))
 
     def reset(self) -> None:
         """Forget the episode."""
@@ -79,11 +81,11 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
         if len(rest) == len(scenario.agents):
             raise ValueError(f"there is no {uav!r} in the team: {', '.join(scenario.agents)}")
         self.others = Team(scenario, rest)
-        self.mode: ActionMode = (
-            make_mode(scenario, "displacement")
-            if base == "none"
-            else Correction(scenario.believed, base)
-        )
+        self.mode: ActionMode = make_mode(scenario, "displacement")
+        if base != "none":
+            self.mode = correction = Correction(scenario.believed, base)
+            check_part(correction.base, 1)
+        self._memory: Any = None
         chosen = chosen_leaves(scenario, self.mode, leaves)
         self.leaves = tuple(chosen)
         self.observation_space = flat_box(chosen)
@@ -101,6 +103,8 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Score the UAV's estimate, and move everybody on."""
+        if self._memory is None:
+            raise ValueError(f"{self.scenario.name}: call reset() first")
         chosen = torch.as_tensor(np.asarray(action, np.float32)).view(1, 1, -1)
         if chosen.shape[-1] != len(self.mode.bounds[0]) or not bool(chosen.isfinite().all()):
             raise ValueError(

@@ -104,6 +104,8 @@ class CoLocVecEnv(VecEnv):
         return self._flat(self.pilot.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
+        if self.world.cursor < 0:
+            raise ValueError(f"{self.scenario.name}: call reset() first")
         shape = (self.num_envs, self.pilot.width)
         actions = np.asarray(actions, np.float32)
         if actions.shape != shape or not np.isfinite(actions).all():

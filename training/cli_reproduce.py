@@ -12,9 +12,10 @@ from training.terminal import progress
 
 
 class Paper(StrEnum):
-    """Papers that can be reproduced."""
+    """Papers that can be reproduced, and ``marl``: what policies learn in the environment."""
 
     pfnn = "pfnn"
+    marl = "marl"
 
 
 class Part(StrEnum):
@@ -26,7 +27,7 @@ class Part(StrEnum):
 
 
 def reproduce(
-    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**")],
+    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **marl**")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report and store.")],
     part: Annotated[
         Part, typer.Option(help="The paper's own tables and figures, the study beyond, or both.")
@@ -39,7 +40,10 @@ def reproduce(
     ] = None,
     variants: Annotated[
         str | None,
-        typer.Option(metavar="A,B,C", help="These variants of the study beyond only."),
+        typer.Option(
+            metavar="A,B,C",
+            help="These variants of the study beyond only; for **marl** these trainings.",
+        ),
     ] = None,
     report_only: Annotated[
         bool, typer.Option("--report-only", help="Fly nothing: report what DIR/store has.")
@@ -60,6 +64,10 @@ def reproduce(
     where the last one stopped. Other settings, other code and other weights make other entries, so
     nothing is ever mixed. DIR/report.md says what became of every claim.
 
+    **marl** is no paper: it trains policies with five seeds each (DIR/runs, resumed where they
+    stopped) and flies them beside the filters in 40 worlds; --agents, --part and --steps are not
+    for it.
+
     **Examples**
 
     coloc reproduce pfnn --out results/pfnn --jobs 2
@@ -68,6 +76,8 @@ def reproduce(
 
     coloc reproduce pfnn --out results/pfnn --part robustness --agents ekf,ekf_trust
     --variants default,nlos,hard
+
+    coloc reproduce marl --out results/marl --runs 40 --jobs 2
     """
     for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
         if value is not None and value < 1:
@@ -76,9 +86,12 @@ def reproduce(
         raise ValueError(f"--seed {seed} is not allowed: a whole number from 0 to 2^62")
     if data is not None:
         os.environ["COLOC_DATA"] = str(data)
+    # What MKL computes would else depend on where in memory it lies; said before it is first used.
+    os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
     import torch
 
     from training.evaluate import split_agents
+    from training.reproduce.marl.run import reproduce as run_marl
     from training.reproduce.pfnn.run import reproduce as run
 
     torch.set_num_threads(1)
@@ -86,8 +99,14 @@ def reproduce(
     where = None if variants is None else variants.split(",")
     if fresh:
         shutil.rmtree(out / "store", ignore_errors=True)
+    if paper is Paper.marl and (agents or steps or part is not Part.all):
+        raise ValueError("marl takes no --agents, --part or --steps")
+    fly = not report_only
     with progress() as tell:
-        run(out, part.value, runs, seed, wanted, where, steps, jobs, not report_only, tell, _say)
+        if paper is Paper.marl:
+            run_marl(out, runs, seed, where, jobs, fly, tell, _say)
+        else:
+            run(out, part.value, runs, seed, wanted, where, steps, jobs, fly, tell, _say)
     typer.echo(f"written to {out}/report.md")
 
 

@@ -24,7 +24,7 @@ from torchrl.trainers import ReplayBufferTrainer
 from agents import make
 from agents.actor import Actor, Body
 from agents.correction import with_base
-from agents.learned_policy import PolicyAgent, actor_for, mode_of
+from agents.learned_policy import PolicyAgent, actor_for, inputs_of, mode_of
 from coloc_env.batched import CoLocEnv
 from coloc_env.per_uav import PerUavEnv
 from coloc_env.scenario import Scenario
@@ -143,6 +143,12 @@ def _ppo(
             for i, scene in enumerate(scenes)
         ]
 
+    kinds = {(e.scenario.horizon, e.n_uavs, *inputs_of(e.mode).items()) for e in environments(0, 1)}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"{name}: variants={variants!r} must have one horizon, one number of UAVs, and the "
+            "same leaves for a policy to read"
+        )
     samples = _random_steps(environments(world_seed(seed, epochs, worlds), min(share, 16)), seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

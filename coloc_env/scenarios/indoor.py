@@ -1,5 +1,7 @@
 """``indoor-v0``: six UAVs circling in a room with landmarks and UWB (PF-NN paper, section 3.1)."""
 
+from typing import Literal
+
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Process, Scenario
@@ -26,6 +28,7 @@ def indoor(
     uwb_std: float = 0.2,
     nlos: float = 0.0,
     nlos_bias: float = 1.0,
+    nlos_kind: Literal["exponential", "constant"] = "exponential",
     uwb_tail: float = 0.0,
     uwb_tail_std: float = 1.0,
     uwb_uniform: float = 0.0,
@@ -94,6 +97,7 @@ def indoor(
         std=uwb_std,
         nlos=nlos,
         nlos_bias=nlos_bias,
+        nlos_kind=nlos_kind,
         tail=uwb_tail,
         tail_std=uwb_tail_std,
         uniform=uwb_uniform,

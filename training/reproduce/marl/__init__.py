@@ -1,0 +1,1 @@
+"""What policies learn in the environment, beside the filters and the bound."""

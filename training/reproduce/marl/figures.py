@@ -1,0 +1,79 @@
+"""Learning curves beside the filters and the bound."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from coloc_env.render.style import INK, MUTED
+from training.figures import STYLE
+from training.metrics import Floats
+from training.reproduce.marl.plan import Trained
+
+_ACROSS = 4  # panels side by side
+_LINES = {  # of the filters
+    "ekf": (MUTED, ":"),
+    "ekf:robust=huber": (MUTED, "--"),
+    "ekf_trust": ("#009E73", "-."),
+}
+_OWN = "#0072B2"
+_TRIED = {"mixed": "default", "huber-nlos": "nlos", "huber-uwb": "uwb", "displacement": "default"}
+
+
+def draw(
+    planned: Sequence[Trained],
+    curves: Mapping[str, Sequence[tuple[Floats, Floats]]],
+    filters: Mapping[str, Mapping[str, float]],
+    bounds: Mapping[str, float | None],
+    file: Path,
+) -> str:
+    """Write the figure, a panel a training; its caption."""
+    shown = [one for one in planned if curves[one.key]]
+    rows = max(1, -(-len(shown) // _ACROSS))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.5, 0.6 + 2.5 * rows), layout="constrained")
+        FigureCanvasAgg(figure)
+        panels = figure.subplots(rows, min(_ACROSS, max(1, len(shown))), squeeze=False)
+        for axes in panels.flat[len(shown) :]:
+            axes.set_visible(False)
+        for axes, one in zip(panels.flat, shown, strict=False):
+            for steps, rmse in curves[one.key]:
+                axes.plot(steps / 1e6, rmse, color=_OWN, linewidth=1.0, alpha=0.55)
+            where = _TRIED.get(one.key, one.key)
+            if one.key != "mixed":
+                for name, (colour, style) in _LINES.items():
+                    if name in filters.get(where, {}):
+                        axes.axhline(filters[where][name], color=colour, ls=style, lw=1.2)
+                if bounds.get(where):
+                    axes.axhline(bounds[where], color=INK, linewidth=1.2)
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if _few(value) else "")
+            axes.tick_params(axis="y", which="minor", labelsize=8)
+            axes.set_title(one.title, fontsize=9, loc="left")
+            axes.set_xlim(left=0)
+        figure.supxlabel("agent-steps (million)", fontsize=9)
+        figure.supylabel("RMSE in flight (m)", fontsize=9)
+        handles = [
+            mpl.lines.Line2D([], [], color=c, ls=s, label=label)
+            for label, (c, s) in {
+                "training seeds": (_OWN, "-"),
+                **_LINES,
+                "posterior bound": (INK, "-"),
+            }.items()
+        ]
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8.5)
+        figure.savefig(file, dpi=150)
+    return (
+        "RMSE in flight, exploration and first seconds included, over agent-steps; a line a "
+        "training seed. Filters and bound: whole runs of 20 s."
+    )
+
+
+def _few(value: float) -> bool:
+    """Whether a minor tick is worth a label: twos and fives."""
+    digit = round(value / 10 ** np.floor(np.log10(value)))
+    return digit in (2, 5)
