@@ -32,6 +32,7 @@ CHANGED: dict[str, Any] = {
     "uwb_std": 0.7,
     "nlos": 0.5,
     "nlos_bias": 2.0,
+    "nlos_kind": "constant",
     "uwb_tail": 0.5,
     "uwb_tail_std": 3.0,
     "uwb_uniform": 0.5,
@@ -60,6 +61,7 @@ CHANGED: dict[str, Any] = {
 # Overrides that show only together with another.
 WITH: dict[str, dict[str, Any]] = {
     "nlos_bias": {"nlos": 0.5},
+    "nlos_kind": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "accel_bias": {"imu_bias": True},
     "gyro_bias": {"imu_bias": True},
