@@ -91,7 +91,7 @@ VARIANTS = (
     "pf500:perturb=fixed:tempering=false",
 )
 REFUSED = {("ekf_joint", "slots")}
-TWINS = ("pf800",)  # of pf500, but for the number of particles, which is set here
+TWINS = ("pf800", "ippo", "sb3-ppo")  # of pf500 and mappo, but for what is set here
 CASES = [
     *((n, f) for n in LOCALIZERS for f in FAMILIES if (n, f) not in REFUSED and n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
