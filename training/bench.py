@@ -27,6 +27,7 @@ from agents import LOCALIZERS, make
 from coloc_env.scenarios import make_scenario
 from training.bench_cases import Case, Timed, cases
 from training.bench_figures import FIGURES, draw
+from training.bench_learning import learning_cases
 from training.bench_parts import PROFILED, step_parts
 from training.bench_peers import peers
 from training.evaluate import ms_per_step
@@ -80,7 +81,7 @@ def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:
     ``parts``: where it goes, in ms by part.
     """
     with _one_thread():
-        chosen = [*cases(), *peers()]
+        chosen = [*cases(), *learning_cases(), *peers()]
         environments = _rounds(chosen, 1 if quick else 15)
         localizers = _localizers(quick) if agents else {}
     best = {name: figures["agent_steps_per_s"] for name, figures in environments.items()}
