@@ -67,19 +67,22 @@ class PolicyAgent(Localizer[PolicyBelief]):
                 self.actor = actor_for(self.mode)
         else:
             card = card_of(weights)
-            if card["kind"] != Actor.kind or "architecture" not in card:
+            if card["kind"] != Actor.kind:
                 raise ValueError(
                     f"{weights} holds weights of kind {card['kind']!r}: a policy's are needed"
                 )
-            architecture = card["architecture"]
-            self.mode = mode_of(believed, architecture["mode"])
-            known, given = architecture["inputs"], inputs_of(self.mode)
+            try:
+                with torch.random.fork_rng(devices=[]):
+                    self.actor = Actor(**card["architecture"])
+            except (AttributeError, KeyError, TypeError) as error:
+                raise ValueError(f"{weights}: its card describes no policy: {error}") from None
+            self.mode = mode_of(believed, self.actor.architecture["mode"])
+            known, given = self.actor.architecture["inputs"], inputs_of(self.mode)
             if known != given:
                 raise ValueError(
                     f"{weights} was trained on the leaves {_words(known)}: this scenario has "
                     f"{_words(given)}"
                 )
-            self.actor = Actor(**architecture)
             load(weights, self.actor)
         self.actor.requires_grad_(False)
 

@@ -62,7 +62,9 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
     (default: those that the action mode recommends). The horizon truncates.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium's convention)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's convention)
+        "render_modes": ["human", "rgb_array"]
+    }
 
     def __init__(
         self,
@@ -76,6 +78,7 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
     ) -> None:
         scenario = scenario_from(scenario, overrides)
         self.env = CoLocParallelEnv(scenario, render_mode)
+        self.metadata = {**self.metadata, "render_fps": self.env.metadata["render_fps"]}
         self.render_mode, self.uav, self.scenario = render_mode, uav, scenario
         rest = {agent: others for agent in scenario.agents if agent != uav}
         if len(rest) == len(scenario.agents):

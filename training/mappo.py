@@ -31,7 +31,16 @@ from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flights, fly, world_seed
 from training.play import play
-from training.runs import Progress, Training, at_least, make_trainer, register, scenario_of
+from training.runs import (
+    Progress,
+    Training,
+    at_least,
+    make_trainer,
+    positive,
+    register,
+    scenario_of,
+    shares,
+)
 
 NORMALIZING = 40  # random steps from which inputs are normalized
 _KEPT = (
@@ -123,12 +132,8 @@ def _ppo(
     at_least(name, 1, worlds=worlds, epochs=epochs, steps=steps, passes=passes, hidden=hidden)
     at_least(name, 1, minibatches=minibatches)
     at_least(name, 0, score_runs=score_runs, seed=seed)
-    for key, value in (("learning_rate", learning_rate), ("clip", clip)):
-        if not 0 < value < float("inf"):
-            raise ValueError(f"{name}: {key}={value} is not allowed: more than 0")
-    for key, value in (("gamma", gamma), ("gae_lambda", gae_lambda), ("entropy", entropy)):
-        if not 0 <= value <= 1:
-            raise ValueError(f"{name}: {key}={value} is not allowed: a number in [0, 1]")
+    positive(name, learning_rate=learning_rate, clip=clip)
+    shares(name, gamma=gamma, gae_lambda=gae_lambda, entropy=entropy)
     scenes = [scenario_of(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
     if worlds % len(scenes) or any(scene.horizon < steps for scene in scenes):
         raise ValueError(

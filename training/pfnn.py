@@ -26,7 +26,15 @@ from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flight, Flights, fly, world_seed
 from training.play import play
-from training.runs import Progress, Training, at_least, make_trainer, register, scenario_of
+from training.runs import (
+    Progress,
+    Training,
+    at_least,
+    make_trainer,
+    positive,
+    register,
+    scenario_of,
+)
 
 EVERY = 10  # steps between trainings (section 2.3)
 PARTICLES = 50  # of each UAV that one training looks at (section 3.3.2)
@@ -136,8 +144,7 @@ def pfnn(
     """
     at_least("pfnn", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
     at_least("pfnn", 0, score_runs=score_runs, seed=seed)
-    if not 0 < learning_rate < float("inf"):
-        raise ValueError(f"pfnn: learning_rate={learning_rate} is not allowed: more than 0")
+    positive("pfnn", learning_rate=learning_rate)
     scene = scenario_of(scenario)
     if scene.horizon < EVERY:
         raise ValueError(f"pfnn: a horizon of {scene.horizon} steps is too short: {EVERY} at least")

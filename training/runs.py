@@ -104,6 +104,20 @@ def at_least(training: str, least: int, **chosen: int) -> None:
             raise ValueError(f"{training}: {name}={value} is not allowed: {least} to {_MOST}")
 
 
+def positive(training: str, **chosen: float) -> None:
+    """ValueError for a number that is not more than 0."""
+    for key, value in chosen.items():
+        if not 0 < value < float("inf"):
+            raise ValueError(f"{training}: {key}={value} is not allowed: more than 0")
+
+
+def shares(training: str, **chosen: float) -> None:
+    """ValueError for a number beyond [0, 1]."""
+    for key, value in chosen.items():
+        if not 0 <= value <= 1:
+            raise ValueError(f"{training}: {key}={value} is not allowed: a number in [0, 1]")
+
+
 def scenario_of(text: str) -> Scenario:
     """A scenario with overrides as in ``indoor-v0:nlos=0.3:horizon=200``."""
     name, *overrides = text.split(":")

@@ -19,7 +19,7 @@ from agents.learned_policy import actor_for
 from coloc_env.vec_env import CoLocVecEnv
 from training.flights import world_seed
 from training.mappo import score
-from training.runs import Training, at_least, register, scenario_of
+from training.runs import Training, at_least, positive, register, scenario_of, shares
 
 _RUNNING = ("obs_rms", "ret_rms")
 
@@ -172,6 +172,8 @@ def sb3_ppo(
     at_least(name, 1, worlds=worlds, epochs=epochs, passes=passes, hidden=hidden)
     at_least(name, 1, minibatches=minibatches, steps=steps)
     at_least(name, 0, score_runs=score_runs, seed=seed)
+    positive(name, learning_rate=learning_rate, clip=clip)
+    shares(name, gamma=gamma)
     scene = scenario_of(scenario)
     if scene.horizon % steps:
         raise ValueError(f"{name}: steps={steps} must divide the horizon, {scene.horizon}")
@@ -181,6 +183,8 @@ def sb3_ppo(
         worlds_env = with_base(worlds_env, base, feedback)
     env = VecNormalize(worlds_env, gamma=gamma)
     rows = worlds_env.num_envs * steps
+    if 2 * minibatches > rows:
+        raise ValueError(f"{name}: minibatches={minibatches} is not allowed: at most {rows // 2}")
     model = PPO(
         "MlpPolicy",
         env,

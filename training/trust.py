@@ -23,7 +23,15 @@ from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flights, fly, world_seed
 from training.play import play
-from training.runs import Progress, Training, at_least, make_trainer, register, scenario_of
+from training.runs import (
+    Progress,
+    Training,
+    at_least,
+    make_trainer,
+    positive,
+    register,
+    scenario_of,
+)
 
 # What the networks meet: each alone, all at once, and nothing at all.
 VARIANTS = (
@@ -151,8 +159,7 @@ def trust(
     """
     at_least("trust", 1, worlds=worlds, epochs=epochs, steps=steps)
     at_least("trust", 0, score_runs=score_runs, seed=seed)
-    if not 0 < learning_rate < float("inf"):
-        raise ValueError(f"trust: learning_rate={learning_rate} is not allowed: more than 0")
+    positive("trust", learning_rate=learning_rate)
     scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
     network = untrained(TrustNetwork, seed)
     filters: list[Any] = [make("ekf_trust", scene, weights="none") for scene in scenes]
