@@ -12,12 +12,14 @@ from coloc_env.render.style import INK, MUTED
 from training.figures import STYLE
 from training.metrics import Floats
 from training.reproduce.marl.plan import Trained
+from training.reproduce.study import WORLD
 
 _ACROSS = 4  # panels side by side
 _LINES = {  # of the filters
     "ekf": (MUTED, ":"),
     "ekf:robust=huber": (MUTED, "--"),
     "ekf_trust": ("#009E73", "-."),
+    "pfnn_trust": ("#D55E00", "-."),
 }
 _OWN = "#0072B2"
 _TRIED = {"mixed": "default", "huber-nlos": "nlos", "huber-uwb": "uwb", "displacement": "default"}
@@ -49,6 +51,10 @@ def draw(
                         axes.axhline(filters[where][name], color=colour, ls=style, lw=1.2)
                 if bounds.get(where):
                     axes.axhline(bounds[where], color=INK, linewidth=1.2)
+                if WORLD in filters.get(where, {}):
+                    words = f"dead reckoning: {filters[where][WORLD]:.0f} m"
+                    axes.text(0.98, 0.95, words, transform=axes.transAxes, ha="right", va="top",
+                              fontsize=8, color=MUTED)  # fmt: skip
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
             axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if _few(value) else "")

@@ -71,7 +71,7 @@ def write(
         }
         whole[variant.key] = {
             name: metrics.rmse(results.agents[name].error, results.scored)
-            for name in FILTERS
+            for name in (WORLD, *FILTERS)
             if name in results.agents
         }
     curves = {one.key: learning_curve(one, folder_of_runs) for one in planned}
