@@ -96,7 +96,8 @@ class Pilot:
     def __init__(self, mode: ActionMode, world: World) -> None:
         self.mode, self.world = mode, world
         self.width = len(mode.bounds[0])
-        self._silent = not mode.leaves
+        self._silent = not mode.leaves and type(mode).reset is ActionMode.reset
+        self._begun = False
         self._memory: Any = None
         self._leaves: Leaves = {}
 
@@ -107,14 +108,14 @@ class Pilot:
             return {}
         observation = self.world.observation()
         fresh, leaves = self.mode.observe(self.mode.reset(observation), observation)
-        if rows is not None and self._leaves and not bool(rows.all()):
+        if rows is not None and self._begun and not bool(rows.all()):
             chosen = rows[:, None].expand(observation.batch_size)
-            fresh = fresh.where(chosen, self._memory)
+            fresh = None if fresh is None else fresh.where(chosen, self._memory)
             leaves = {
                 name: torch.where(chosen.unsqueeze(-1), leaf, self._leaves[name])
                 for name, leaf in leaves.items()
             }
-        self._memory, self._leaves = fresh, leaves
+        self._memory, self._leaves, self._begun = fresh, leaves, True
         return leaves
 
     def observe(self) -> Leaves:

@@ -36,6 +36,7 @@ class Slot:
 
     def state(self) -> Array:
         """The privileged state of its world."""
+        self._env.started()
         return self._env.pilot.state()[self.world].numpy().copy()
 
 
@@ -47,7 +48,8 @@ class CoLocVecEnv(VecEnv):
     ``displacement`` or an ``ActionMode`` (``agents.with_base(env, "ekf")`` for corrections on a
     localizer). At the horizon every environment is truncated (``TimeLimit.truncated``,
     ``terminal_observation``) and starts anew. World b starts with seed ``seed + b``, and moves on
-    by ``num_worlds`` an episode; ``seed(s)`` sets that for the next ``reset()``.
+    by ``num_worlds`` an episode; ``seed(s)`` sets that for the next ``reset()``. (So does
+    stable-baselines3's ``PPO(seed=s)``: call ``seed`` after making the model.)
 
     Raises ValueError where UAVs can fail: those of one world end together.
     """
@@ -104,8 +106,7 @@ class CoLocVecEnv(VecEnv):
         return self._flat(self.pilot.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
-        if self.world.cursor < 0:
-            raise ValueError(f"{self.scenario.name}: call reset() first")
+        self.started()
         shape = (self.num_envs, self.pilot.width)
         actions = np.asarray(actions, np.float32)
         if actions.shape != shape or not np.isfinite(actions).all():
@@ -157,7 +158,13 @@ class CoLocVecEnv(VecEnv):
         """The first world, if there is a render mode."""
         if self._renderer is None:
             return [None]
+        self.started()
         return [self._renderer.render(self.world, "rgb_array")]
+
+    def started(self) -> None:
+        """ValueError before the first ``reset()``."""
+        if self.world.cursor < 0:
+            raise ValueError(f"{self.scenario.name}: call reset() first")
 
     def _flat(self, leaves: dict[str, Float32[Tensor, "B N F"]]) -> Array:
         """The chosen leaves at the current step, a row per UAV."""

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
-from coloc_env.actions import chosen_leaves
+from coloc_env.actions import ActionMode, chosen_leaves
 from coloc_env.observation import flat_box
 from coloc_env.parallel import CoLocParallelEnv
 
@@ -21,12 +21,16 @@ class Flatten(BaseParallelWrapper):
     def __init__(self, env: CoLocParallelEnv, leaves: Sequence[str] | None = None) -> None:
         super().__init__(env)
         chosen = chosen_leaves(env.scenario, env.mode, leaves)
-        self.leaves, self._space = tuple(chosen), flat_box(chosen)
+        self.leaves, self._wanted, self._space = tuple(chosen), leaves, flat_box(chosen)
         self.observation_spaces = dict.fromkeys(env.possible_agents, self._space)
 
     def observation_space(self, agent: str) -> gym.spaces.Box:
         """The same space object for every agent and call."""
         return self._space
+
+    def with_action(self, action: str | ActionMode) -> "Flatten":
+        """The same flat environment in another action mode."""
+        return Flatten(self.env.with_action(action), self._wanted)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

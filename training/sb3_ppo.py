@@ -76,7 +76,7 @@ class Sb3Trainer:
             self.model._last_obs = None  # the epoch's worlds start now
             rate = self.rate * (1 - self.epoch / self.epochs)
             self.model.lr_schedule = partial(_constant, rate)
-            self.model.learn(frames, callback=_Errors(), reset_num_timesteps=False)
+            self.model.learn(frames, _Errors(), log_interval=frames + 1, reset_num_timesteps=False)
             self.collected_frames = self.model.num_timesteps
             self.epoch += 1
             exported(self.model, self.env, self.actor)
@@ -116,10 +116,12 @@ def _constant(rate: float, left: float) -> float:
 
 
 class _Errors(BaseCallback):
-    """Logs the RMSE (m) of a rollout whose rewards are −error."""
+    """Logs the RMSE (m) of a rollout whose rewards are −error, with what PPO tells of training on
+    it (SB3 itself would keep that until after the next rollout, when a save point is past)."""
 
     def _on_rollout_start(self) -> None:
         self.squares: list[float] = []
+        self.logger.dump(self.num_timesteps)
 
     def _on_step(self) -> bool:
         env: Any = self.training_env
@@ -128,6 +130,9 @@ class _Errors(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self.logger.record("rmse", float(np.sqrt(np.mean(self.squares))))
+
+    def _on_training_end(self) -> None:
+        self.logger.dump(self.num_timesteps)
 
 
 class _Metrics(KVWriter):

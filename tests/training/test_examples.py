@@ -1,0 +1,104 @@
+"""The examples run, at sizes of a few seconds, and what they train learns."""
+
+import ast
+import importlib
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import training.examples
+
+SCRIPTS = sorted(Path(training.examples.__file__).parent.glob("[a-z]*.py"))
+
+
+@pytest.fixture(autouse=True)
+def _leave_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
+def example(name: str, *needs: str) -> Any:
+    """An example's module; the test is skipped where a library is missing."""
+    for library in needs:
+        pytest.importorskip(library)
+    return importlib.import_module(f"training.examples.{name}")
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_docstring_names_installation_and_command(script: Path) -> None:
+    text = ast.get_docstring(ast.parse(script.read_text())) or ""
+    lines = [line.strip() for line in text.splitlines()]
+    assert any(line.startswith("pip install") for line in lines)
+    assert f"python -m training.examples.{script.stem}" in lines
+
+
+def test_pettingzoo_loop_and_its_cycle_agree() -> None:
+    found = example("pettingzoo_loop").main(episodes=1, horizon=40)
+    assert found["landmarks"] < 1.0 < found["random"]
+    assert found["landmarks, AEC"] == found["landmarks"]
+
+
+def test_mixed_team_gives_each_uav_its_method() -> None:
+    found = example("mixed_team").main(learned="dead_reckoning", episodes=1, horizon=40, seed=3)
+    assert len(found) == 6
+    assert found["uav_0"] == max(found.values()) > 1.0
+    assert sorted(found.values())[-2] < 1.0
+
+
+def test_mixed_team_takes_a_learned_policy() -> None:
+    assert example("mixed_team").main(episodes=1, horizon=10)["uav_0"] < 0.5
+
+
+def test_gym_single_uav_learns() -> None:
+    module = example("gym_single_uav", "stable_baselines3")
+    found = module.main(steps=800, envs=2, horizon=50, episodes=2)
+    assert found["after"] < 0.7 * found["before"]
+
+
+def test_sb3_ppo_corrects_its_base() -> None:
+    found = example("sb3_ppo", "stable_baselines3").main(steps=24_000, number=16, horizon=50)
+    assert found["after"] < 0.8 * found["before"]
+
+
+def test_sb3_sac_learns() -> None:
+    found = example("sb3_sac", "stable_baselines3").main(steps=4_000, number=4, horizon=50)
+    assert found["after"] < 0.5 * found["before"]
+
+
+def test_torchrl_mappo_corrects_its_base() -> None:
+    module = example("torchrl_mappo", "torchrl.objectives.multiagent")
+    found = module.main(steps=20_000, worlds=16, horizon=50)
+    assert found["after"] < 0.8 * found["before"]
+
+
+def test_supersuit_loses_what_the_example_says() -> None:
+    env = example("supersuit_sb3", "supersuit", "stable_baselines3").worlds(2, horizon=5, seed=0)
+    first = env.reset()
+    assert not np.array_equal(first[:6], first[6:])  # the copies fly different worlds
+    for step in range(5):
+        _, _, dones, infos = env.step(np.zeros((12, 3), np.float32))
+        assert dones.all() == (step == 4)
+    assert "TimeLimit.truncated" not in infos[0]
+    assert infos[0]["episode_rmse"] == 0.0
+    for method in (env.seed, env.get_attr):
+        with pytest.raises(AttributeError):
+            method("scenario")
+
+
+def test_supersuit_learns() -> None:
+    module = example("supersuit_sb3", "supersuit", "stable_baselines3")
+    found = module.main(steps=6_000, copies=2, horizon=50)
+    assert found["after"] < 0.5 * found["before"]
+
+
+def test_rllib_learns() -> None:
+    module = example("rllib_ppo", "ray.rllib")
+    found = module.main(iterations=3, steps=400, horizon=50, episodes=1)
+    assert found["after"] < found["before"]
+
+
+def test_benchmarl_learns() -> None:
+    found = example("benchmarl_mappo", "benchmarl").main(iterations=4, worlds=10, horizon=50)
+    assert found["after"] < found["before"]
