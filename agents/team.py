@@ -23,7 +23,8 @@ class Team:
 
     Values are agents with their options, as on the command line. UAVs of one method share a
     localizer; each further one costs a step of its own. Call ``reset()`` before every episode, then
-    ``actions = team(observations)``. Raises ValueError for an unknown UAV, and for a method that has to act for the whole team.
+    ``actions = team(observations)``. Raises ValueError for an unknown UAV, and for a method that
+    has to act for the whole team.
     """
 
     def __init__(self, scenario: Scenario, methods: Mapping[str, str]) -> None:
