@@ -53,7 +53,6 @@ class CoLocEnv(EnvBase):
         self.world = World(scenario, num_envs, device)
         self.mode = make_mode(scenario, action)
         self._pilot = Pilot(self.mode, self.world)
-        self._first_seed = seed
         self._sensed: Sensed | None = None
         self._set_seed(seed)
         self._make_specs()
@@ -90,7 +89,7 @@ class CoLocEnv(EnvBase):
         )
 
     def with_action(self, action: str | ActionMode) -> "CoLocEnv":
-        """The same environment, from its first episode on, in another action mode."""
+        """The same environment, from the seed that it was given last, in another action mode."""
         b = self.batch_size[0]
         return CoLocEnv(self.scenario, b, self.device, self._first_seed, action)
 
@@ -98,6 +97,7 @@ class CoLocEnv(EnvBase):
         if seed is not None:
             rows = torch.arange(self.batch_size[0], device=self.device)
             self._seeds = int(seed) + rows
+            self._first_seed = int(seed)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         rows = None

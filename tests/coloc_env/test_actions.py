@@ -647,3 +647,11 @@ def test_memory_and_leaves_need_not_go_together(kind: type[ActionMode]) -> None:
             for key in again.keys(True, True):
                 ours, theirs = seen[row, part][key].numpy(), again[key].numpy()
                 np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=str(key))
+
+
+def test_another_mode_starts_at_the_seed_that_was_given_last() -> None:
+    made = batched(indoor(), "estimate", 2, 5)
+    made.set_seed(9)
+    again = made.with_action("displacement").reset()
+    expected = batched(indoor(), "displacement", 2, 9).reset()
+    assert torch.equal(again["state"], expected["state"])
