@@ -116,7 +116,7 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
             raise ValueError(f"{name}: {key} is given twice")
         chosen[key] = value
     options.check(name, chosen, known)
-    believed = scenario.believed if isinstance(scenario, Scenario) else scenario
+    believed = scenario if isinstance(scenario, Believed) else scenario.believed
     try:
         return LOCALIZERS[name](believed, **chosen)
     except ValueError as error:

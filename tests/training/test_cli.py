@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -173,7 +174,10 @@ def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "training.cli", "evaluate", "indoor-v0"]
     command += ["--agents", "dead_reckoning", "--no-bound", "--out", str(tmp_path / "deep" / "out")]
     environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
-    process = subprocess.Popen(command, env=environment, cwd=tmp_path, stderr=subprocess.PIPE)
+    listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which shells' jobs are not
+    process = subprocess.Popen(
+        command, env=environment, cwd=tmp_path, stderr=subprocess.PIPE, preexec_fn=listening
+    )
     try:
         for _ in range(600):
             time.sleep(0.05)
