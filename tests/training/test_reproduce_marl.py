@@ -112,10 +112,10 @@ def test_learning_curves_are_means_over_epochs(tmp_path: Path) -> None:
     folder = tmp_path / "nlos-0" / "metrics" / "scalars"
     folder.mkdir(parents=True)
     lines = [f"{100 * (i + 1)},{3.0 if i < 8 else 4.0}\n" for i in range(17)]
-    (folder / "rmse.csv").write_text("".join(lines))
-    ((steps, rmse),) = report.learning_curve(replace(plan.trainings()[0], key="nlos"), tmp_path)
+    (folder / "error.csv").write_text("".join(lines))
+    ((steps, error),) = report.learning_curve(replace(plan.trainings()[0], key="nlos"), tmp_path)
     assert steps.tolist() == [800, 1600]
-    assert rmse.tolist() == [3.0, 4.0]
+    assert error.tolist() == [3.0, 4.0]
 
 
 def test_the_study_can_be_trained_by_its_commands() -> None:

@@ -42,8 +42,8 @@ def draw(
         for axes in panels.flat[len(shown) :]:
             axes.set_visible(False)
         for axes, one in zip(panels.flat, shown, strict=False):
-            for steps, rmse in curves[one.key]:
-                axes.plot(steps / 1e6, rmse, color=_OWN, linewidth=1.0, alpha=0.55)
+            for steps, error in curves[one.key]:
+                axes.plot(steps / 1e6, error, color=_OWN, linewidth=1.0, alpha=0.55)
             where = _TRIED.get(one.key, one.key)
             if one.key != "mixed":
                 for name, (colour, style) in _LINES.items():
@@ -59,23 +59,23 @@ def draw(
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
             axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if _few(value) else "")
             axes.tick_params(axis="y", which="minor", labelsize=8)
-            axes.set_title(one.title, fontsize=9, loc="left")
+            axes.set_title(one.title, fontsize=8.5, loc="left")
             axes.set_xlim(left=0)
         figure.supxlabel("agent-steps (million)", fontsize=9)
-        figure.supylabel("RMSE in flight (m)", fontsize=9)
+        figure.supylabel("mean error in flight (m)", fontsize=9)
         handles = [
             mpl.lines.Line2D([], [], color=c, ls=s, label=label)
             for label, (c, s) in {
                 "training seeds": (_OWN, "-"),
                 **_LINES,
-                "posterior bound": (INK, "-"),
+                "posterior bound (an RMSE)": (INK, "-"),
             }.items()
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8.5)
         figure.savefig(file, dpi=150)
     return (
-        "RMSE in flight, exploration and first seconds included, over agent-steps; a line a "
-        "training seed. Filters and bound: whole runs of 20 s."
+        "Mean error in flight, exploration included, over agent-steps; a line a training seed. "
+        "Filters, and the bound as an RMSE, over runs of 20 s."
     )
 
 

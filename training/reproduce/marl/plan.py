@@ -65,15 +65,15 @@ def trainings() -> list[Trained]:
     return [
         Trained(
             "mixed",
-            "a mixture of default, NLOS, false matches and biased accelerometer",
+            "a mixture of four variants",
             options=(("scenario", SCENARIO), ("variants", mixture), ("epochs", 16)),
         ),
         _single("uwb", "UWB wrongly believed", _UWB),
         _single("nlos", "NLOS 30 %", (("nlos", 0.3),)),
         _single("false", "false matches 10 %", (("false_matches", 0.1),)),
         _single("accel", "accelerometer bias", _ACCEL),
-        _on_huber("huber-nlos", "NLOS 30 %, on a Huber EKF", (("nlos", 0.3),)),
-        _on_huber("huber-uwb", "UWB wrongly believed, on a Huber EKF", _UWB),
+        _on_huber("huber-nlos", "NLOS 30 %, on Huber", (("nlos", 0.3),)),
+        _on_huber("huber-uwb", "UWB wrongly believed, on Huber", _UWB),
         Trained(
             "displacement",
             "default, localizing alone",

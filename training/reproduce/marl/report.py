@@ -70,9 +70,7 @@ def write(
             if all(name in results.agents for name in names)
         }
         whole[variant.key] = {
-            name: metrics.rmse(results.agents[name].error, results.scored)
-            for name in (WORLD, *FILTERS)
-            if name in results.agents
+            name: one.error for name, one in found[variant.key].items() if name in (WORLD, *FILTERS)
         }
     curves = {one.key: learning_curve(one, folder_of_runs) for one in planned}
     caption = figures.draw(planned, curves, whole, bounds, folder / "curves.png")
@@ -122,13 +120,13 @@ def write(
 
 
 def learning_curve(one: Trained, folder: Path) -> list[tuple[Floats, Floats]]:
-    """For each run that is there: agent-steps, and the RMSE (m) of every epoch's flights."""
+    """For each run that is there: agent-steps, and the mean error (m) of every epoch's flights."""
     curves: list[tuple[Floats, Floats]] = []
-    for file in sorted(folder.glob(f"{one.key}-[0-9]*/metrics/scalars/rmse.csv")):
+    for file in sorted(folder.glob(f"{one.key}-[0-9]*/metrics/scalars/error.csv")):
         rows = np.loadtxt(file, delimiter=",", ndmin=2)
         batches = 8  # of 25 steps, in an epoch of 200
         whole = rows[: len(rows) // batches * batches].reshape(-1, batches, 2)
-        curves.append((whole[:, -1, 0], np.sqrt((whole[..., 1] ** 2).mean(1))))
+        curves.append((whole[:, -1, 0], whole[..., 1].mean(1)))
     return curves
 
 
