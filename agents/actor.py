@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from agents.checkpoint import Learned
-from agents.layers import Linear, sigmoid
+from agents.layers import Linear, row_product, sigmoid
 
 ACTIVATIONS = {"tanh": torch.tanh, "relu": torch.relu}
 SQUASHES = {"tanh": torch.tanh, "clip": lambda x: x.clamp(-1.0, 1.0)}
@@ -119,8 +119,8 @@ class Actor(Learned):
         if self.lstm is not None:
             lstm: Any = self.lstm
             h, c = memory.unsqueeze(-2).chunk(2, -1)
-            gates = _rows(x, lstm.weight_ih_l0) + lstm.bias_ih_l0
-            gates = gates + (_rows(h, lstm.weight_hh_l0) + lstm.bias_hh_l0)
+            gates = row_product(x, lstm.weight_ih_l0.mT) + lstm.bias_ih_l0
+            gates = gates + (row_product(h, lstm.weight_hh_l0.mT) + lstm.bias_hh_l0)
             i, f, g, o = gates.chunk(4, -1)
             c = sigmoid(f) * c + sigmoid(i) * torch.tanh(g)
             x = sigmoid(o) * torch.tanh(c)
@@ -131,8 +131,3 @@ class Actor(Learned):
     def memory_size(self) -> int:
         """How many numbers a UAV's memory has."""
         return 0 if self.lstm is None else 2 * self.lstm.hidden_size
-
-
-def _rows(x: Float32[Tensor, "*s 1 i"], weight: Any) -> Float32[Tensor, "*s 1 o"]:
-    """Each UAV's product with a matrix, one by one."""
-    return x @ weight.mT.expand(*x.shape[:-2], *weight.mT.shape)

@@ -6,7 +6,8 @@ they were trained. Nothing is ever executed by loading: safetensors holds number
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -34,10 +35,17 @@ class Learned(nn.Module):
 _L = TypeVar("_L", bound=Learned)
 
 
-def untrained(kind: type[_L], seed: int) -> _L:
-    """A neural part with random weights, drawn from ``seed`` and from no shared generator."""
+@contextmanager
+def drawn_from(seed: int) -> Iterator[None]:
+    """What torch draws inside comes from ``seed`` and leaves its shared generator as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
+        yield
+
+
+def untrained(kind: type[_L], seed: int) -> _L:
+    """A neural part with random weights, drawn from ``seed`` and from no shared generator."""
+    with drawn_from(seed):
         return kind()
 
 

@@ -15,8 +15,9 @@ from agents.models.measurements.vectors import Heights
 from agents.models.process import make_process
 from agents.residuals import pulls, robust_statistics
 from coloc_env.actions import ActionMode, Leaves
+from coloc_env.displacement import Displacement
 from coloc_env.fixes import fix_leaves, relative_fixes
-from coloc_env.observation import Observation
+from coloc_env.observation import Observation, prior_action
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
 
@@ -69,10 +70,6 @@ class Correction(ActionMode):
         self.features = ("base_std", *mean, "residuals", "last_action")
 
     @property
-    def bounds(self) -> tuple[list[float], list[float]]:
-        return [-1.0] * self.dim, [1.0] * self.dim
-
-    @property
     def settings(self) -> dict[str, Any]:
         return {"name": self.name, "base": self._base, "feedback": self.feedback}
 
@@ -91,15 +88,14 @@ class Correction(ActionMode):
         }
 
     def reset(self, observation: Observation) -> Based:
-        prior, d = observation["prior"], self.dim
-        log_std = prior[..., -2 - d : -2].clamp_min(1e-6).log()
-        estimate = torch.cat((prior[..., : 2 * d], log_std), -1)
+        estimate = prior_action(observation, self.dim)
+        nothing = torch.zeros_like(estimate[..., : self.dim])
         return Based(
             belief=self.base.reset(observation),
             estimate=estimate,
-            reach=torch.zeros_like(prior[..., :d]),
-            last_action=torch.zeros_like(prior[..., :d]),
-            batch_size=prior.shape[:2],
+            reach=nothing,
+            last_action=nothing,
+            batch_size=estimate.shape[:2],
         )
 
     @torch.no_grad()
@@ -144,6 +140,11 @@ class Correction(ActionMode):
 
     def reference(self, memory: Based) -> Float32[Tensor, "B N d"]:
         return memory.estimate[..., : self.dim]
+
+
+def learners_mode(believed: Believed, base: str, feedback: float = 0.0) -> ActionMode:
+    """Corrections on a base; for ``none`` displacements of the UAV's own."""
+    return Displacement(believed) if base == "none" else Correction(believed, base, feedback)
 
 
 class Face(Protocol):

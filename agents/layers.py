@@ -21,8 +21,14 @@ class Linear(nn.Linear):
         weight = self.weight.mT
         if self.out_features == 1:
             weight = weight.expand(-1, 2)
-        product = x @ weight.expand(*x.shape[:-2], *weight.shape)
-        return product[..., : self.out_features] + self.bias
+        return row_product(x, weight)[..., : self.out_features] + self.bias
+
+
+def row_product(
+    x: Float[Tensor, "*s m i"], weight: Float[Tensor, "i o"]
+) -> Float[Tensor, "*s m o"]:
+    """x @ weight, each of x's last two dimensions a product of its own."""
+    return x @ weight.expand(*x.shape[:-2], *weight.shape)
 
 
 def sigmoid(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:

@@ -8,7 +8,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.actor import Actor
-from agents.checkpoint import card_of, load
+from agents.checkpoint import card_of, drawn_from, load
 from agents.correction import Correction
 from agents.localizer import Estimate, Localizer, register
 from coloc_env.actions import ActionMode
@@ -62,8 +62,7 @@ class PolicyAgent(Localizer[PolicyBelief]):
         super().__init__(believed)
         if weights == "none":
             self.mode: ActionMode = Correction(believed)
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(0)
+            with drawn_from(0):
                 self.actor = actor_for(self.mode)
         else:
             card = card_of(weights)
@@ -72,7 +71,7 @@ class PolicyAgent(Localizer[PolicyBelief]):
                     f"{weights} holds weights of kind {card['kind']!r}: a policy's are needed"
                 )
             try:
-                with torch.random.fork_rng(devices=[]):
+                with drawn_from(0):
                     self.actor = Actor(**card["architecture"])
             except (AttributeError, KeyError, TypeError) as error:
                 raise ValueError(f"{weights}: its card describes no policy: {error}") from None

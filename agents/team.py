@@ -7,10 +7,10 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.correction import Correction
+from agents.correction import Correction, learners_mode
 from agents.localizer import make
 from agents.policy import ParallelPolicy, check_part
-from coloc_env.actions import ActionMode, chosen_leaves, make_mode
+from coloc_env.actions import chosen_leaves
 from coloc_env.observation import box, flat_box, stack
 from coloc_env.parallel import CoLocParallelEnv
 from coloc_env.scenario import Scenario
@@ -85,10 +85,9 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
         if len(rest) == len(scenario.agents):
             raise ValueError(f"there is no {uav!r} in the team: {', '.join(scenario.agents)}")
         self.others = Team(scenario, rest)
-        self.mode: ActionMode = make_mode(scenario, "displacement")
-        if base != "none":
-            self.mode = correction = Correction(scenario.believed, base)
-            check_part(correction.base, 1)
+        self.mode = learners_mode(scenario.believed, base)
+        if isinstance(self.mode, Correction):
+            check_part(self.mode.base, 1)
         self._memory: Any = None
         chosen = chosen_leaves(scenario, self.mode, leaves)
         self.leaves = tuple(chosen)

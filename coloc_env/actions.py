@@ -40,9 +40,9 @@ class ActionMode(ABC):
         self.dim = believed.arena.dim
 
     @property
-    @abstractmethod
     def bounds(self) -> tuple[list[float], list[float]]:
-        """Lowest and highest numbers of one UAV's action."""
+        """Lowest and highest numbers of one UAV's action: ±1 for each axis."""
+        return [-1.0] * self.dim, [1.0] * self.dim
 
     @property
     def settings(self) -> dict[str, Any]:

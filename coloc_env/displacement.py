@@ -39,14 +39,8 @@ class Displacement(ActionMode):
     def __init__(self, believed: Believed) -> None:
         super().__init__(believed)
         self._fixes = fix_leaves(self.believed)
-        self.features = (
-            *(name for name in ("fix_mean", "fix_share") if self._fixes),
-            "last_action",
-        )
-
-    @property
-    def bounds(self) -> tuple[list[float], list[float]]:
-        return [-1.0] * self.dim, [1.0] * self.dim
+        seen = ("fix_mean", "fix_share") if self._fixes else ()
+        self.features = (*seen, "last_action")
 
     @property
     def leaves(self) -> dict[str, Leaf]:

@@ -55,6 +55,12 @@ def prior_width(dim: int) -> int:
     return 3 * dim + (4 if dim == 3 else 1) + 2
 
 
+def prior_action(observation: Observation, dim: int) -> Float32[Tensor, "B N A"]:
+    """What each UAV is told of its start, as an action."""
+    prior = observation["prior"]
+    return torch.cat((prior[..., : 2 * dim], prior[..., -2 - dim : -2].clamp_min(1e-6).log()), -1)
+
+
 def static_leaves(scenario: Scenario) -> dict[str, Leaf]:
     """Leaves that stay the same over an episode: the prior and the maps."""
     leaves = {"prior": Leaf(prior_width(scenario.arena.dim))}

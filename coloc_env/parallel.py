@@ -69,10 +69,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
         self.mode = make_mode(scenario, action)
         self._pilot = Pilot(self.mode, self.world)
-        space, actions = (
-            observation_space(observed_leaves(scenario, self.mode)),
-            box(self.mode.bounds),
-        )
+        space = observation_space(observed_leaves(scenario, self.mode))
+        actions = box(self.mode.bounds)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
         self.state_space = box(privileged_bounds(scenario, self.mode))

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from agents.correction import with_base
+from agents.correction import learners_mode
 from coloc_env.batched import CoLocEnv
 from coloc_env.parallel import parallel_env
 from coloc_env.per_uav import PerUavEnv
+from coloc_env.scenarios import make_scenario
 from coloc_env.vec_env import CoLocVecEnv
 from training import mappo as _mappo  # noqa: F401  (registers its trainings)
 from training import sb3_ppo as _sb3_ppo  # noqa: F401
@@ -16,7 +17,7 @@ from training.bench_cases import Case, Timed
 from training.runs import TRAININGS
 
 WORLDS, HORIZON = 64, 50
-_SETTINGS: dict[str, Any] = {"motion": "random", "horizon": HORIZON}
+_SCENE = make_scenario("indoor-v0", motion="random", horizon=HORIZON)
 _BASES = {"displacement": "none", "corrects ekf": "ekf"}
 
 
@@ -32,7 +33,7 @@ def learning_cases() -> Iterator[Case]:
 
 
 def _pettingzoo() -> Timed:
-    env = parallel_env(action="displacement", **_SETTINGS)
+    env = parallel_env(_SCENE, action="displacement")
     actions = {agent: np.zeros(3, np.float32) for agent in env.possible_agents}
 
     def run(steps: int) -> None:
@@ -46,7 +47,7 @@ def _pettingzoo() -> Timed:
 
 def _per_uav(base: str) -> Callable[[], Timed]:
     def setup() -> Timed:
-        env = PerUavEnv(_on(CoLocEnv(num_envs=WORLDS, action=_action(base), **_SETTINGS), base))
+        env = PerUavEnv(CoLocEnv(_SCENE, WORLDS, action=learners_mode(_SCENE.believed, base)))
 
         def run(steps: int) -> None:
             env.rollout(steps, break_when_any_done=False)
@@ -58,7 +59,7 @@ def _per_uav(base: str) -> Callable[[], Timed]:
 
 def _vec_env(base: str) -> Callable[[], Timed]:
     def setup() -> Timed:
-        env = _on(CoLocVecEnv(num_worlds=WORLDS, action=_action(base), **_SETTINGS), base)
+        env = CoLocVecEnv(_SCENE, WORLDS, action=learners_mode(_SCENE.believed, base))
         env.reset()
         actions = np.zeros((env.num_envs, 3), np.float32)
 
@@ -92,15 +93,6 @@ def _trained(name: str, base: str) -> Callable[[], Timed]:
         return Timed(run, HORIZON)
 
     return setup
-
-
-def _action(base: str) -> str:
-    return "displacement" if base == "none" else "estimate"
-
-
-def _on(env: Any, base: str) -> Any:
-    """Corrections on a base, if there is one."""
-    return env if base == "none" else with_base(env, base)
 
 
 class _Silent:

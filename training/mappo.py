@@ -23,7 +23,8 @@ from torchrl.trainers import ReplayBufferTrainer
 
 from agents import make
 from agents.actor import Actor, Body
-from agents.correction import with_base
+from agents.checkpoint import drawn_from
+from agents.correction import learners_mode
 from agents.learned_policy import PolicyAgent, actor_for, inputs_of, mode_of
 from coloc_env.batched import CoLocEnv
 from coloc_env.per_uav import PerUavEnv
@@ -53,9 +54,8 @@ _MEMORY = ("hidden", "cell")
 def environment(scene: Scenario, worlds: int, seed: int, base: str, feedback: float) -> PerUavEnv:
     """``worlds`` worlds seen by each UAV for itself: corrections on a base's estimates, or, with
     ``base=none``, displacements of the UAV's own."""
-    if base == "none":
-        return PerUavEnv(CoLocEnv(scene, worlds, seed=seed, action="displacement"))
-    return PerUavEnv(with_base(CoLocEnv(scene, worlds, seed=seed), base, feedback))
+    mode = learners_mode(scene.believed, base, feedback)
+    return PerUavEnv(CoLocEnv(scene, worlds, seed=seed, action=mode))
 
 
 def policy_of(actor: Actor) -> ProbabilisticActor:
@@ -148,17 +148,16 @@ def _ppo(
             for i, scene in enumerate(scenes)
         ]
 
-    kinds = {(e.scenario.horizon, e.n_uavs, *inputs_of(e.mode).items()) for e in environments(0, 1)}
+    ones = environments(0, 1)
+    kinds = {(e.scenario.horizon, e.n_uavs, *inputs_of(e.mode).items()) for e in ones}
     if len(kinds) > 1:
         raise ValueError(
             f"{name}: variants={variants!r} must have one horizon, one number of UAVs, and the "
             "same leaves for a policy to read"
         )
     samples = _random_steps(environments(world_seed(seed, epochs, worlds), min(share, 16)), seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        mode = environments(0, 1)[0].mode
-        actor = actor_for(mode, hidden=hidden, recurrent=recurrent)
+    with drawn_from(seed):
+        actor = actor_for(ones[0].mode, hidden=hidden, recurrent=recurrent)
         read = torch.cat([samples[key] for key in reads], -1)
         critic = Critic(read.shape[-1], hidden)
         actor.body.normal.fit(samples["observation"])
@@ -204,12 +203,11 @@ def _ppo(
     trainer.register_op("batch_process", fill)
     trainer.register_op("process_optim_batch", ReplayBufferTrainer(buffer, iterate=True).sample)
     trainer.register_op("pre_steps_log", _figures)
-    rivals = ["dead_reckoning" if base == "none" else base, "ekf:robust=huber"]
     return Training(
         module=actor,
         flights=flights,
         trainer=trainer,
-        score=partial(score, name, actor, scenes, list(dict.fromkeys(rivals)), score_runs),
+        score=partial(score, name, actor, scenes, score_runs),
     )
 
 
@@ -240,8 +238,7 @@ def ippo(**options: Any) -> Training:
 
 def _random_steps(envs: Sequence[PerUavEnv], seed: int) -> TensorDictBase:
     """What is seen in some random steps."""
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(seed)
+    with drawn_from(seed), torch.no_grad():
         seen = [env.rollout(NORMALIZING).select("observation", "state").flatten() for env in envs]
     return torch.cat(seen)
 
@@ -256,16 +253,17 @@ def score(
     name: str,
     actor: Actor,
     scenes: Sequence[Scenario],
-    rivals: Sequence[str],
     runs: int,
     tell: Progress,
 ) -> Mapping[str, Any]:
-    """RMSE (m) of the policy and of rivals in the worlds of seeds 0 … runs − 1 of each scenario."""
+    """RMSE (m) of the policy, its base and a Huber EKF in worlds 0 … runs − 1 of each scenario."""
     if runs == 0:
         return {}
     found: dict[str, Any] = {}
+    settings = actor.architecture["mode"]
+    rivals = (settings.get("base", "dead_reckoning"), "ekf:robust=huber")
     for scene in scenes:
-        mode = mode_of(scene.believed, dict(actor.architecture["mode"]))
+        mode = mode_of(scene.believed, settings)
         team: dict[str, Any] = {name: PolicyAgent.of(scene.believed, actor, mode)}
         team |= {rival: make(rival, scene) for rival in rivals}
         key = ":".join(f"{k}={v}" for k, v in scene.overrides.items())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
-from coloc_env.observation import Observation
+from coloc_env.observation import prior_action
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
@@ -132,12 +132,6 @@ def _fly(
         observation = world.observation()
         tick(len(seeds))
     return tape
-
-
-def prior_action(observation: Observation, dim: int) -> Float32[Tensor, "B N A"]:
-    """What each UAV is told of its start, as an action."""
-    prior = observation["prior"]
-    return torch.cat((prior[..., : 2 * dim], prior[..., -2 - dim : -2].clamp_min(1e-6).log()), -1)
 
 
 def finite_action(

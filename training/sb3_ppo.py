@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
 from agents.actor import Actor
-from agents.correction import with_base
+from agents.correction import learners_mode
 from agents.learned_policy import actor_for
 from coloc_env.vec_env import CoLocVecEnv
 from training.flights import world_seed
@@ -182,10 +182,8 @@ def sb3_ppo(
     scene = scenario_of(scenario)
     if scene.horizon % steps:
         raise ValueError(f"{name}: steps={steps} must divide the horizon, {scene.horizon}")
-    action = "displacement" if base == "none" else "estimate"
-    worlds_env = CoLocVecEnv(scene, worlds, action=action)
-    if base != "none":
-        worlds_env = with_base(worlds_env, base, feedback)
+    mode = learners_mode(scene.believed, base, feedback)
+    worlds_env = CoLocVecEnv(scene, worlds, action=mode)
     env = VecNormalize(worlds_env, gamma=gamma)
     rows = worlds_env.num_envs * steps
     if 2 * minibatches > rows:
@@ -204,12 +202,11 @@ def sb3_ppo(
         device="cpu",
         policy_kwargs={"net_arch": [hidden, hidden], "log_std_init": float(np.log(0.3))},
     )
-    actor = actor_for(worlds_env.mode, hidden=hidden, squash="clip")
+    actor = actor_for(mode, hidden=hidden, squash="clip")
     trainer = Sb3Trainer(model, env, actor, epochs, partial(world_seed, seed, worlds=worlds))
-    rivals = ["dead_reckoning" if base == "none" else base, "ekf:robust=huber"]
     return Training(
         module=actor,
         flights=trainer,
         trainer=trainer,
-        score=partial(score, name, actor, [scene], list(dict.fromkeys(rivals)), score_runs),
+        score=partial(score, name, actor, [scene], score_runs),
     )

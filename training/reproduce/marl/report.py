@@ -55,7 +55,6 @@ def write(
     """All of ``FILES``."""
     found: dict[str, dict[str, Figures]] = {}
     bounds: dict[str, float | None] = {}
-    whole: dict[str, dict[str, float]] = {}
     for variant, policies in variants():
         if not study.can(variant):
             continue
@@ -69,11 +68,9 @@ def write(
             for key, names in there.items()
             if all(name in results.agents for name in names)
         }
-        whole[variant.key] = {
-            name: one.error for name, one in found[variant.key].items() if name in (WORLD, *FILTERS)
-        }
     curves = {one.key: learning_curve(one, folder_of_runs) for one in planned}
-    caption = figures.draw(planned, curves, whole, bounds, folder / "curves.png")
+    errors = {key: {name: o.error for name, o in there.items()} for key, there in found.items()}
+    caption = figures.draw(planned, curves, errors, bounds, folder / "curves.png")
     judged = [(goal, *_judge(goal, found)) for goal in goals()]
     text = [
         "# Policies that learn, beside the filters and the bound",
