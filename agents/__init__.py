@@ -2,6 +2,8 @@
 
 from agents import ekf as _ekf  # noqa: F401
 from agents import ekf_joint as _ekf_joint  # noqa: F401
+from agents import emvf as _emvf  # noqa: F401
+from agents import hybrid as _hybrid  # noqa: F401
 from agents import learned_policy as _learned_policy  # noqa: F401
 from agents import pf as _pf  # noqa: F401
 from agents import pfnn as _pfnn  # noqa: F401

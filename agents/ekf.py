@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -112,6 +112,23 @@ class DeadReckoning(Localizer[GaussianBelief]):
 
     def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
         return belief.moved(offset)
+
+    def gaussian(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        return belief.state, belief.covariance
+
+    def restarted(
+        self,
+        belief: GaussianBelief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> GaussianBelief:
+        return belief.replace(
+            state=torch.where(rows.unsqueeze(-1), state, belief.state),
+            covariance=torch.where(rows[..., None, None], covariance, belief.covariance),
+        )
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         """What is remembered of measurements before the first: nothing."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -74,6 +74,27 @@ class Localizer(ABC, Generic[Belief]):
     def moved(self, belief: Belief, offset: Float[Tensor, "B N d"]) -> Belief:
         """The belief with its position shifted by ``offset`` (m), as sure of it as before."""
         raise ValueError(f"{self.name} cannot be corrected from outside")
+
+    def watch(self, belief: Belief, observation: Observation) -> Belief:
+        """``step`` for one whose estimate is not asked for: cheaper where it can be."""
+        return self.step(belief, observation)[0]
+
+    def gaussian(
+        self, belief: Belief, observation: Observation
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        """Mean state and error covariance (float64) after the observation was used or watched."""
+        raise ValueError(f"{self.name} gives no Gaussian to restart another filter from")
+
+    def restarted(
+        self,
+        belief: Belief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> Belief:
+        """The belief with the UAVs marked in ``rows`` begun anew from a Gaussian, which has taken
+        the last observation into account."""
+        raise ValueError(f"{self.name} cannot be restarted from outside")
 
     def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
         """A method's own figures at this step (particles, effective sample size, …)."""

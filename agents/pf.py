@@ -6,8 +6,8 @@ Particles live in padded tensors with a live count per UAV, fixed or adaptive (P
 Algorithms 1 and 2).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -16,59 +16,21 @@ from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
-from agents.models.measurements import Neighbours, heard, make_measurements
+from agents.models.measurements import heard, make_measurements
 from agents.models.process import make_process
-from agents.models.update import Update, iterated_update, linearizer
-from agents.particles import population
-from agents.particles.belief import ParticleBelief, normal, own_keys
-from agents.particles.cloud import (
-    effective_sample_size,
-    moments,
-    normalized,
-    select,
-)
+from agents.particles import population, sampling
+from agents.particles.belief import ParticleBelief, Step, normal, own_keys
+from agents.particles.cloud import Moments, moments, select
+from agents.particles.degeneracy import Remedy, degenerate
 from agents.particles.likelihood import log_likelihood
-from agents.particles.renewal import (
-    FLOOR,
-    RESAMPLE,
-    Perturb,
-    Renewal,
-    padded,
-    padded_weights,
-)
-from agents.particles.tempering import increment
-from agents.robust import Prediction, RobustScreen, Screen, Trust
+from agents.particles.proposal import guided, proposed
+from agents.particles.renewal import FLOOR, Perturb, Renewal, padded, padded_weights
+from agents.robust import RobustScreen, Screen, Trust
 from coloc_env import noise
-from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
-
-_START_STEPS = 3  # steps in which the likelihood is tempered down to that share
-_RESCUE = 0.1  # the share below which particles are drawn anew later
-_STAGES = 40  # more than any likelihood has needed
-_WIDEN = 1.1  # of the guided proposal's covariance
-_ITERATIONS = 3  # of the update that screens measurements and guides proposals
-
-
-@dataclass(frozen=True)
-class _Step:
-    """What a step's evidence is made from."""
-
-    belief: ParticleBelief
-    observation: Observation
-    neighbours: Neighbours
-    trusts: Sequence[Trust]
-    key: Int64[Tensor, "B N"]
-
-
-@dataclass(frozen=True)
-class _Guide:
-    """A Gaussian prior at a predicted cloud's moments, and its update by the measurements."""
-
-    prior: Prediction
-    found: Update
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -81,7 +43,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     enough survive those; ``proposal=ekf`` does so at every step.
     ``tempering=false`` uses every likelihood as it comes.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
-    ``compile=true`` compiles the step's two large parts at the first step (it takes up to a minute
+    ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.
     """
 
@@ -120,7 +82,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.compiled = compile
         if compile:
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
-            self.renewal.conclude = torch.compile(self.renewal.conclude, dynamic=False)  # type: ignore[method-assign]
+            self.renewal.weigh = torch.compile(self.renewal.weigh, dynamic=False)  # type: ignore[method-assign]
+            self.renewal.renew = torch.compile(self.renewal.renew, dynamic=False)  # type: ignore[method-assign]
 
     @property
     def exchanges(self) -> bool:
@@ -130,15 +93,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         prior = observation["prior"]
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
-        m, d = self.capacity, self.process.dim
-        draws = normal(key, "pf.reset", self.process.error_size, m)
-        delta = draws * covariance.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)
-        particles = self.process.boxplus(mean.unsqueeze(-2).expand(-1, -1, m, -1), delta)
-        if self.believed.prior.kind == "uniform":
-            arena = self.believed.arena
-            low, high = (prior.new_tensor(x) for x in (arena.low, arena.high))
-            place = (normal(key, "pf.place", d, m) * 0.5**0.5).erf() * 0.5 + 0.5
-            particles = concat((low + place * (high - low), particles[..., d:]))
+        m = self.capacity
+        particles = sampling.from_prior(self.process, self.believed, mean, covariance, key, m)
         count = torch.full_like(key, self.particles)
         live = population.alive(count, m)
         return ParticleBelief(
@@ -148,7 +104,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             key=key,
             step=torch.zeros_like(key),
             ess_share=torch.ones_like(prior[..., 0]),
-            last=mean[..., : 2 * d],
+            last=mean[..., : 2 * self.process.dim],
             memory=self.screen.memory(observation),
             batch_size=key.shape,
         )
@@ -156,68 +112,52 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def step(
         self, belief: ParticleBelief, observation: Observation
     ) -> tuple[ParticleBelief, Estimate]:
-        key = noise.fold(belief.key, belief.step)
-        slots, w = self._slots(belief.count), self.process.noise_size
-        draws = normal(key, "pf.step", w + self.process.error_size, slots)
-        u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
-        dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        neighbours = heard(self.believed, observation)
-        particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
-        now = _Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
-        memory = belief.memory
-        if self.models and (self.screen.judges or self.proposal == "ekf"):
-            particles = self.process.propagate(particles, u, dt, draws[..., :w])
-            guide = self._guide(particles, log_weights, now)
-            now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
-            if self.proposal == "ekf":
-                particles, log_weights = self._drawn(guide, now, slots)
-            gain = self._evidence(particles, log_weights, now)
-            short = self._short(log_weights + gain, now)
-        else:
-            guide = None
-            particles, gain, short = self._foresee(
-                particles, log_weights, u, dt, draws[..., :w], now
-            )
-        if self.tempering and self.models and bool(short.any()):
-            particles, log_weights = self._rescued(particles, log_weights, gain, short, guide, now)
-        else:
-            log_weights = log_weights + gain
-        particles, log_weights, cloud, ess, target = self.renewal.conclude(
-            particles, log_weights, belief.count, draws[..., w:], key
-        )
-        particles, log_weights = self.renewal.shrunk(
-            particles, log_weights, cloud, belief.count, target
-        )
-        d = self.process.dim
-        least = torch.eye(d, dtype=torch.float64, device=key.device) * FLOOR["position"] ** 2
-        estimate = Estimate(
-            position=cloud.mean[..., :d],
-            velocity=cloud.mean[..., d : 2 * d],
-            covariance=cloud.covariance[..., :d, :d] + least,
-            batch_size=key.shape,
-        )
+        key, neighbours = noise.fold(belief.key, belief.step), heard(self.believed, observation)
+        now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
+        particles, log_weights, memory = self._updated(now)
+        weighed = self.renewal.weigh(particles, log_weights, belief.count)
+        particles, log_weights = self.renewal.renewed(particles, weighed, belief.count, key)
+        mean = weighed.cloud.mean
         after = ParticleBelief(
-            particles=padded(particles, cloud.mean, self.capacity),
+            particles=padded(particles, mean, self.capacity),
             log_weights=padded_weights(log_weights, self.capacity),
-            count=target,
+            count=weighed.target,
             key=belief.key,
             step=belief.step + 1,
-            ess_share=ess / belief.count,
-            last=cloud.mean[..., : 2 * d],
+            ess_share=weighed.ess / belief.count,
+            last=mean[..., : 2 * self.process.dim],
             memory=memory,
             batch_size=key.shape,
         )
-        return after, estimate
+        return after, self._estimate(weighed.cloud)
 
     def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
         return moments(self.process, belief.particles, belief.log_weights.exp()).mean
 
     def moved(self, belief: ParticleBelief, offset: Float[Tensor, "B N d"]) -> ParticleBelief:
-        d, offset = self.process.dim, offset.to(torch.float32)
-        particles = belief.particles
-        places = particles[..., :d] + offset.unsqueeze(-2)
-        last = torch.cat((belief.last[..., :d] + offset, belief.last[..., d:]), -1)
-        return belief.replace(particles=concat((places, particles[..., d:])), last=last)
+        return belief.moved(offset)
+
+    def restarted(
+        self,
+        belief: ParticleBelief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> ParticleBelief:
+        key, like = noise.fold(belief.key, belief.step), belief.particles
+        draws = normal(key, "pf.restart", self.process.error_size, self.capacity)
+        drawn = sampling.gaussian(self.process, state, covariance, draws)
+        state = state.to(like.dtype)
+        count = torch.where(rows, self.particles, belief.count)
+        live = population.alive(count, self.capacity)
+        drawn = torch.where(live.unsqueeze(-1), drawn, state.unsqueeze(-2))
+        row = rows.unsqueeze(-1)
+        return belief.replace(
+            particles=torch.where(row.unsqueeze(-1), drawn, like),
+            log_weights=torch.where(row, population.equal_log_weights(live), belief.log_weights),
+            count=count,
+            last=torch.where(row, state[..., : 2 * self.process.dim], belief.last),
+        )
 
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
         return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
@@ -235,6 +175,33 @@ class ParticleFilter(Localizer[ParticleBelief]):
             return self.capacity
         return min(self.capacity, int(count.max()) + population.GROW)
 
+    def _updated(
+        self, now: Step
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Float[Tensor, "B N K"]]:
+        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
+        normalized), and what the screen remembers."""
+        belief = now.belief
+        slots = self._slots(belief.count)
+        particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
+        draws = normal(now.key, "pf.step", self.process.noise_size, slots)
+        u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
+        dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
+        guide, memory = None, belief.memory
+        if self.models and (self.screen.judges or self.proposal == "ekf"):
+            particles = self.process.propagate(particles, u, dt, draws)
+            guide = guided(self.screen, self.renewal.floor, particles, log_weights, now)
+            now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
+            if self.proposal == "ekf":
+                particles, log_weights = proposed(self.process, guide, now, slots)
+            gain = self._evidence(particles, log_weights, now)
+            few = self._degenerate(log_weights + gain, now)
+        else:
+            particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
+        if not (self.models and bool(few.any())):
+            return particles, log_weights + gain, memory
+        remedy = Remedy(partial(self._evidence, now=now), self.screen, self.renewal, now)
+        return *remedy.mended(particles, log_weights, gain, few, guide), memory
+
     def _foresee(
         self,
         particles: Float32[Tensor, "B N M S"],
@@ -242,135 +209,60 @@ class ParticleFilter(Localizer[ParticleBelief]):
         u: Float32[Tensor, "B N 1 U"],
         dt: Float32[Tensor, "B N 1"],
         draws: Float32[Tensor, "B N M W"],
-        now: _Step,
+        now: Step,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
         """Each particle moves with its own draw of the motion's noise, and meets the evidence;
         whether that leaves too few."""
         particles = self.process.propagate(particles, u, dt, draws)
         gain = self._evidence(particles, log_weights, now)
-        return particles, gain, self._short(log_weights + gain, now)
+        return particles, gain, self._degenerate(log_weights + gain, now)
 
-    def _short(self, log_weights: Float32[Tensor, "B N M"], now: _Step) -> Bool[Tensor, "B N"]:
-        """Whether weights are those of too few particles."""
-        share = torch.where(now.belief.step < _START_STEPS, RESAMPLE, _RESCUE)
-        return effective_sample_size(log_weights) < share * now.belief.count
-
-    def _guide(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        log_weights: Float32[Tensor, "B N M"],
-        now: _Step,
-    ) -> _Guide:
-        """A Gaussian update at the moments of the predicted cloud."""
-        cloud = moments(self.process, particles, log_weights.exp())
-        covariance = cloud.covariance + torch.diag(
-            self.renewal.floor.to(cloud.covariance.device) ** 2
-        )
-        prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
-        linearize = linearizer(self.process, self.models, now.observation, now.neighbours)
-        return _Guide(prior, iterated_update(prior, linearize, self.screen, _ITERATIONS))
-
-    def _drawn(
-        self, guide: _Guide, now: _Step, slots: int
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Particles from 1.1 × the guide's posterior, with the log-weights that make them stand for
-        its prior: log N(x; prior) − log N(x; drawn from)."""
-        draws = normal(now.key, "pf.propose", self.process.error_size, slots)
-        root = torch.linalg.cholesky_ex(_WIDEN * guide.found.covariance).L
-        delta = (root.to(draws.dtype) @ draws.mT).mT
-        centre = guide.found.state.to(draws.dtype).unsqueeze(-2)
-        particles = self.process.boxplus(centre, delta)
-        mean = guide.prior.state.to(draws.dtype).unsqueeze(-2)
-        away = self.process.boxminus(particles, mean).double()
-        root = torch.linalg.cholesky_ex(guide.prior.covariance).L
-        scaled = torch.linalg.solve_triangular(root, away.mT, upper=False)
-        ratio = 0.5 * (draws.double().square().sum(-1) - scaled.square().sum(-2))
-        live = population.alive(now.belief.count, slots)
-        return particles, normalized(torch.where(live, ratio, -torch.inf).to(draws.dtype))
-
-    def _rescued(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        log_weights: Float32[Tensor, "B N M"],
-        gain: Float32[Tensor, "B N M"],
-        short: Bool[Tensor, "B N"],
-        guide: _Guide | None,
-        now: _Step,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Particles and unnormalized log-weights where the evidence would leave too few: in the
-        first steps used in stages with a resampling move after each; later, or where a screen has a
-        guide at hand, on particles drawn anew. A UAV that needs neither is not touched."""
-        late = short if self.screen.judges else short & (now.belief.step >= _START_STEPS)
-        early = short & ~late
-        if bool(late.any()):
-            guide = guide or self._guide(particles, log_weights, now)
-            drawn, ratio = self._drawn(guide, now, particles.shape[-2])
-            particles = torch.where(late[..., None, None], drawn, particles)
-            log_weights = torch.where(late.unsqueeze(-1), ratio, log_weights)
-            again = self._evidence(particles, log_weights, now)
-            gain = torch.where(late.unsqueeze(-1), again, gain)
-            # Evidence that even they cannot follow is left to the guide: its posterior, as drawn.
-            lost = (late & self._short(log_weights + gain, now)).unsqueeze(-1)
-            equal = population.equal_log_weights(log_weights > -torch.inf)
-            log_weights = torch.where(lost, equal, log_weights)
-            gain = gain.masked_fill(lost, 0.0)
-        if bool(early.any()):
-            return self._tempered(particles, log_weights, gain, early, now)
-        return particles, log_weights + gain
-
-    def _tempered(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        log_weights: Float32[Tensor, "B N M"],
-        gain: Float32[Tensor, "B N M"],
-        staged: Bool[Tensor, "B N"],
-        now: _Step,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """The evidence in stages for some UAVs, at once for the others."""
-        count = now.belief.count
-        equal = population.equal_log_weights(population.alive(count, particles.shape[-2]))
-        left = torch.ones_like(gain[..., 0])
-        for stage in range(_STAGES):
-            share = left
-            if stage < _STAGES - 1:
-                some = increment(log_weights, gain, left, RESAMPLE * count)
-                share = torch.where(staged, some, left)
-            used = normalized(log_weights + share.unsqueeze(-1) * gain)
-            log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
-            left = left - share
-            go_on = left > 0
-            if not bool(go_on.any()):
-                break
-            weights = log_weights.exp()
-            key = noise.fold(now.key, stage)
-            draws = normal(key, "pf.move", self.process.error_size, weights.shape[-1])
-            moved = self.renewal.resample(
-                moments(self.process, particles, weights), weights, count, draws, key
-            )
-            particles = torch.where(go_on[..., None, None], moved, particles)
-            log_weights = torch.where(go_on.unsqueeze(-1), equal, log_weights)
-            gain = self._evidence(particles, log_weights, now)
-        return particles, log_weights
+    def _degenerate(self, log_weights: Float32[Tensor, "B N M"], now: Step) -> Bool[Tensor, "B N"]:
+        """Whose weights are those of too few particles, which tempering would mend."""
+        if not self.tempering:
+            return torch.zeros_like(log_weights[..., 0], dtype=torch.bool)
+        return degenerate(log_weights, now.belief)
 
     def _evidence(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
-        now: _Step,
+        now: Step,
     ) -> Float32[Tensor, "B N M"]:
         """What the step says of each particle: log-likelihood and learned correction."""
         centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
-        gain = log_likelihood(
-            self.models,
-            self.process,
-            particles,
-            centre,
-            now.observation,
-            now.neighbours,
-            now.trusts,
-        )
+        evidence = now.observation, now.neighbours, now.trusts
+        gain = log_likelihood(self.models, self.process, particles, centre, *evidence)
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
+
+    def _estimate(self, cloud: Moments) -> Estimate:
+        """The weighted cloud's mean, never surer of the position than the floor."""
+        d, covariance = self.process.dim, cloud.covariance
+        least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
+        return Estimate(
+            position=cloud.mean[..., :d],
+            velocity=cloud.mean[..., d : 2 * d],
+            covariance=covariance[..., :d, :d] + least,
+            batch_size=cloud.mean.shape[:2],
+        )
+
+
+@register("pf")
+class Pf(ParticleFilter):
+    """SIR particle filter with 5000 particles per UAV and no tempering (NN-HPFF paper)."""
+
+    name = "pf"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        particles: int = 5000,
+        tempering: bool = False,
+        **options: Any,
+    ) -> None:
+        super().__init__(believed, particles=particles, tempering=tempering, **options)
 
 
 @register("pf500")

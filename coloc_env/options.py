@@ -130,7 +130,7 @@ def _parse(text: str, kind: Any) -> Any:
         values = tuple(_parse(piece, k) for piece, k in zip(pieces, kinds, strict=True))
         return _UNFIT if _UNFIT in values else values
     if origin is typing.Literal:
-        return text if text in inner else _UNFIT
+        return next((each for each in inner if str(each) == text), _UNFIT)
     try:
         value = kind(text)
     except ValueError:

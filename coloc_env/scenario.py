@@ -18,19 +18,28 @@ class Prior:
     """What each UAV is told about its own start.
 
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
-    world; ``kind="uniform"`` tells nothing of the position but that it lies in the arena.
+    world; ``kind="uniform"`` tells nothing of the position but that it lies in the arena, and with
+    ``max_speed`` (m/s) nothing of the velocity but that each component lies within ± that.
     """
 
     position_std: float = 2.0
     velocity_std: float = 0.2
     attitude_std: float = 0.05
     kind: str = "gaussian"
+    max_speed: float | None = None
 
     def __post_init__(self) -> None:
         kinds = ("gaussian", "uniform")
         require(self.kind in kinds, self, "kind", f"one of {', '.join(kinds)}")
         for name in ("position_std", "velocity_std", "attitude_std"):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
+        told = self.max_speed is None or (self.kind == "uniform" and self.max_speed > 0)
+        require(told, self, "max_speed", "a speed > 0, with kind='uniform'")
+
+    @property
+    def velocity_spread(self) -> float:
+        """Standard deviation (m/s) of the velocity about what is told of it."""
+        return self.velocity_std if self.max_speed is None else self.max_speed / 3**0.5
 
 
 @dataclass(frozen=True)
@@ -54,10 +63,19 @@ class Wheeled:
 @dataclass(frozen=True)
 class ConstantVelocity:
     """Velocity driven by white acceleration (``accel_std``, m/s² over one second's square root)
-    and pulled to zero with time constant ``damping`` s (None: not at all)."""
+    and pulled to zero with time constant ``damping`` s (None: not at all).
+
+    ``held``: the acceleration stays the same over each step instead, N(0, accel_std²) m/s².
+    """
 
     accel_std: float = 1.0
     damping: float | None = None
+    held: bool = False
+
+    def __post_init__(self) -> None:
+        require(self.accel_std >= 0, self, "accel_std", "a standard deviation ≥ 0")
+        require(self.damping is None or self.damping > 0, self, "damping", "a time in s > 0")
+        require(not self.held or self.damping is None, self, "held", "without damping")
 
 
 Process = Inertial | Wheeled | ConstantVelocity

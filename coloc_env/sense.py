@@ -147,7 +147,14 @@ def sense(
         part = whole.map(lambda x: x[:, lead - by : lead - by + count])
         return Kinematics(part.position, part.velocity, part.attitude)
 
-    motion = back(0)
+    motion, before = back(0), back(1)
+    if moved.carried is not None:  # nothing that measures motion sees how it was carried
+        still = moved.carried.unsqueeze(-1)
+        before = Kinematics(
+            torch.where(still, motion.position, before.position),
+            torch.where(still, motion.velocity, before.velocity),
+            before.attitude,
+        )
     step_keys = noise.fold(keys.unsqueeze(-1), steps)
     fails_at = fails_at.unsqueeze(1)
     alive = steps.unsqueeze(-1) < fails_at
@@ -155,7 +162,7 @@ def sense(
     window = Window(
         layout=scenario.layout,
         motion=motion,
-        before=back(1),
+        before=before,
         keys=step_keys,
         steps=steps,
         alive=alive,
@@ -214,8 +221,10 @@ def draw_prior(
         position = truth.position + prior.position_std * draws[..., :dim]
         position_std = torch.full_like(position, prior.position_std)
     velocity = truth.velocity + prior.velocity_std * draws[..., dim : 2 * dim]
+    if prior.max_speed is not None:
+        velocity = torch.zeros_like(velocity)
     attitude = rotate_by(truth.attitude, prior.attitude_std * draws[..., 2 * dim :])
-    rest = position.new_tensor((prior.velocity_std, prior.attitude_std)).expand(
+    rest = position.new_tensor((prior.velocity_spread, prior.attitude_std)).expand(
         *position.shape[:2], 2
     )
     return torch.cat((position, velocity, attitude, position_std, rest), -1).to(torch.float32)

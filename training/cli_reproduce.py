@@ -15,7 +15,11 @@ class Paper(StrEnum):
     """Papers that can be reproduced, and ``marl``: what policies learn in the environment."""
 
     pfnn = "pfnn"
+    nnhpff = "nnhpff"
     marl = "marl"
+
+
+_RUNS = {Paper.pfnn: 20, Paper.nnhpff: 100, Paper.marl: 40}
 
 
 class Part(StrEnum):
@@ -27,12 +31,15 @@ class Part(StrEnum):
 
 
 def reproduce(
-    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **marl**")],
+    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **nnhpff**, **marl**")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report and store.")],
     part: Annotated[
         Part, typer.Option(help="The paper's own tables and figures, the study beyond, or both.")
     ] = Part.all,
-    runs: Annotated[int, typer.Option(help="Worlds; figure 9 takes half as many more.")] = 20,
+    runs: Annotated[
+        int | None,
+        typer.Option(help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff, 40 for marl."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first world.")] = 0,
     agents: Annotated[
         str | None,
@@ -42,7 +49,7 @@ def reproduce(
         str | None,
         typer.Option(
             metavar="A,B,C",
-            help="These variants of the study beyond only; for **marl** these trainings.",
+            help="These variants only; of **pfnn** those beyond the paper, of **marl** trainings.",
         ),
     ] = None,
     report_only: Annotated[
@@ -77,7 +84,9 @@ def reproduce(
     coloc reproduce pfnn --out results/pfnn --part robustness --agents ekf,ekf_trust
     --variants default,nlos,hard
 
-    coloc reproduce marl --out results/marl --runs 40 --jobs 2
+    coloc reproduce nnhpff --out results/nnhpff --jobs 2
+
+    coloc reproduce marl --out results/marl --jobs 2
     """
     for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
         if value is not None and value < 1:
@@ -92,7 +101,8 @@ def reproduce(
 
     from training.evaluate import split_agents
     from training.reproduce.marl.run import reproduce as run_marl
-    from training.reproduce.pfnn.run import reproduce as run
+    from training.reproduce.nnhpff.run import reproduce as run_nnhpff
+    from training.reproduce.pfnn.run import reproduce as run_pfnn
 
     torch.set_num_threads(1)
     wanted = None if agents is None else split_agents(agents)
@@ -101,12 +111,16 @@ def reproduce(
         shutil.rmtree(out / "store", ignore_errors=True)
     if paper is Paper.marl and (agents or steps or part is not Part.all):
         raise ValueError("marl takes no --agents, --part or --steps")
-    fly = not report_only
+    if paper is Paper.nnhpff and agents:
+        raise ValueError("nnhpff takes no --agents")
+    fly, count = not report_only, runs or _RUNS[paper]
     with progress() as tell:
         if paper is Paper.marl:
-            run_marl(out, runs, seed, where, jobs, fly, tell, _say)
+            run_marl(out, count, seed, where, jobs, fly, tell, _say)
+        elif paper is Paper.nnhpff:
+            run_nnhpff(out, part.value, count, seed, where, steps, jobs, fly, tell, _say)
         else:
-            run(out, part.value, runs, seed, wanted, where, steps, jobs, fly, tell, _say)
+            run_pfnn(out, part.value, count, seed, wanted, where, steps, jobs, fly, tell, _say)
     typer.echo(f"written to {out}/report.md")
 
 

@@ -64,6 +64,7 @@ def train(
     torch.set_num_threads(threads)
     from coloc_env.options import parse
     from training import mappo as _mappo  # noqa: F401  (registers its trainings)
+    from training import nnhpff as _nnhpff  # noqa: F401
     from training import pfnn as _pfnn  # noqa: F401
     from training import runs
     from training import sb3_ppo as _sb3_ppo  # noqa: F401

@@ -6,7 +6,7 @@ Every UAV of every world is a row of its own (``coloc_env.per_uav``); all share 
 critic sees its own UAV's observation (IPPO) or the privileged state of the team beside it (MAPPO).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial, wraps
 from typing import Any
 
@@ -14,7 +14,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.modules import LSTMModule, ProbabilisticActor, TanhNormal
@@ -30,6 +29,7 @@ from coloc_env.batched import CoLocEnv
 from coloc_env.per_uav import PerUavEnv
 from coloc_env.scenario import Scenario
 from training import metrics
+from training.fleets import SideBySide
 from training.flights import Flights, fly, world_seed
 from training.play import play
 from training.runs import (
@@ -87,22 +87,6 @@ class Critic(nn.Module):
 
     def forward(self, *seen: Tensor) -> Tensor:
         return self.head(self.body(torch.cat(seen, -1)))
-
-
-class Together:
-    """Collectors whose batches of the same step stand side by side in one, row by row."""
-
-    def __init__(self, collectors: Sequence[Collector]) -> None:
-        self.collectors = collectors
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        for batches in zip(*self.collectors, strict=True):
-            yield torch.cat([batch.to_tensordict() for batch in batches])
-
-    def shutdown(self) -> None:
-        """Let go of the environments."""
-        for one in self.collectors:
-            one.shutdown()
 
 
 def _ppo(
@@ -175,14 +159,14 @@ def _ppo(
     loss.make_value_estimator(gamma=gamma, lmbda=gae_lambda)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
-    def launch(epoch: int) -> Together:
+    def launch(epoch: int) -> SideBySide:
         # TorchRL draws actions from torch's shared generator: what an epoch draws must depend on
         # nothing but the epoch, so that a run that resumes at it ends in the same weights.
         torch.manual_seed(world_seed(seed, epoch, worlds))
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * (1 - epoch / epochs)
         flying = environments(world_seed(seed, epoch, worlds))
-        return Together([fly(env, policy, steps) for env in flying])
+        return SideBySide([fly(env, policy, steps) for env in flying])
 
     flights = Flights(launch, epochs)
     rows = worlds * scenes[0].arena.n_uavs

@@ -98,6 +98,12 @@ def per_run(values: Floats, scored: Flags) -> float:
     return mean(total[scored.any(1)])
 
 
+def mean_per_run(values: Floats, counts: Flags) -> Floats:
+    """[R]: mean over steps and UAVs of what counts and is not NaN."""
+    kept = np.where(counts, values, np.nan)
+    return np.array([mean(run) for run in kept])
+
+
 def lost(error: Floats, scored: Flags, dt: float, threshold: float) -> Flags:
     """[R, N]: whether a UAV ends lost, that is, its error exceeds ``threshold`` in every one of the
     last 5 s of steps in which it is scored (all of them, if there are fewer)."""

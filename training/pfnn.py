@@ -10,10 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.objectives import LossModule
-from torchrl.trainers import ReplayBufferTrainer, Trainer
+from torchrl.trainers import Trainer
 
 from agents import make
 from agents.corrector import motion_features
@@ -25,6 +23,7 @@ from coloc_env.batched import CoLocEnv
 from coloc_env.scenario import Scenario
 from training import metrics
 from training.flights import Flight, Flights, fly, world_seed
+from training.offline import offline_trainer
 from training.play import play
 from training.runs import (
     Progress,
@@ -162,12 +161,17 @@ def pfnn(
         trainer = _online(flights, loss, learning_rate, scene.arena.n_uavs)
     else:
         most = worlds * scene.arena.n_uavs * PARTICLES * (steps // EVERY)
-        buffer = ReplayBuffer(
-            storage=LazyTensorStorage(most),
-            sampler=SamplerWithoutReplacement(),
-            batch_size=minibatch,
+        trainer = offline_trainer(
+            flights,
+            loss,
+            _samples,
+            partial(_held_out, loss),
+            learning_rate=learning_rate,
+            most=most,
+            minibatch=minibatch,
+            passes=passes,
+            seed=seed,
         )
-        trainer = _offline(flights, loss, learning_rate, buffer, passes, seed)
     trainer.register_op("pre_steps_log", _figures)
     return Training(
         module=localizer.corrector,
@@ -185,39 +189,18 @@ def _online(flights: Flights, loss: CorrectorLoss, learning_rate: float, n_uavs:
     return trainer
 
 
-def _offline(
-    flights: Flights,
-    loss: CorrectorLoss,
-    learning_rate: float,
-    buffer: ReplayBuffer,
-    passes: int,
-    seed: int,
-) -> Trainer:
-    """Adam on minibatches of the epoch's particles, in an order drawn from (seed, epoch). Worlds
-    are always new ones, so the loss before training on them is the held-out one."""
-    optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
-    trainer = make_trainer(flights, loss, optimizer, steps_per_batch=None, passes=passes)
-    generator = torch.Generator()
-    buffer.set_rng(generator)
+def _samples(batch: TensorDictBase) -> TensorDict:
+    """All particles of a flight that count."""
+    rows = samples_of(batch).flatten()
+    return rows[rows["mask"]]
 
-    def fill(batch: TensorDictBase) -> None:
-        generator.manual_seed(world_seed(seed, flights.epoch, 1))
-        buffer.empty()
-        rows = samples_of(batch).flatten()
-        buffer.extend(rows[rows["mask"]])
 
-    @torch.no_grad()
-    def held_out(batch: TensorDictBase) -> dict[str, float]:
-        rows = buffer[:]
-        return {
-            "held_out_loss": float(loss(rows)["loss_corrector"]),
-            "constant_loss": float(rows["target"].var(unbiased=False)),
-        }
-
-    trainer.register_op("batch_process", fill)
-    trainer.register_op("pre_steps_log", held_out)
-    trainer.register_op("process_optim_batch", ReplayBufferTrainer(buffer, iterate=True).sample)
-    return trainer
+def _held_out(loss: CorrectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
+    """The loss, and that of the best constant."""
+    return {
+        "held_out_loss": loss(rows)["loss_corrector"],
+        "constant_loss": rows["target"].var(unbiased=False),
+    }
 
 
 def _figures(batch: TensorDictBase) -> dict[str, float]:

@@ -1,15 +1,13 @@
 """Training of the trust networks, by truncated backpropagation through a differentiable EKF."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import zip_longest
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.objectives import LossModule
 
 from agents import make
@@ -21,6 +19,7 @@ from coloc_env.batched import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
 from training import metrics
+from training.fleets import TakingTurns
 from training.flights import Flights, fly, world_seed
 from training.play import play
 from training.runs import (
@@ -120,24 +119,6 @@ def _belief(entries: TensorDictBase) -> GaussianBelief:
     return GaussianBelief(**parts, batch_size=parts["step"].shape)
 
 
-class Fleet:
-    """Collectors that yield their batches in turn, as one: for an epoch in several scenarios."""
-
-    def __init__(self, collectors: Sequence[Collector]) -> None:
-        self.collectors = collectors
-        self.frames_per_batch = collectors[0].frames_per_batch
-        self.total_frames = sum(one.total_frames for one in collectors)
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        for batches in zip_longest(*self.collectors):
-            yield from (batch for batch in batches if batch is not None)
-
-    def shutdown(self) -> None:
-        """Let go of the environments."""
-        for one in self.collectors:
-            one.shutdown()
-
-
 @register
 def trust(
     *,
@@ -179,7 +160,7 @@ def trust(
             policy = LocalizerPolicy(ekf, scene, record=partial(_record, i))
             # ("next", "uav", "observation") is the next step's: half the memory.
             collectors.append(fly(env, policy, steps, compact_obs=True))
-        return Fleet(collectors)
+        return TakingTurns(collectors)
 
     flights = Flights(launch, epochs)
     trainer = make_trainer(flights, loss, optimizer, clip_norm=1.0)

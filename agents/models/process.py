@@ -47,6 +47,12 @@ class Process(ABC):
         """The state after ``dt`` seconds; a sample of it with standard normal ``noise``."""
 
     @abstractmethod
+    def retreat(
+        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s U"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s S"]:
+        """The state ``dt`` seconds earlier: what ``propagate`` takes to ``x`` without noise."""
+
+    @abstractmethod
     def linearize(
         self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s U"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s E E"], Float[Tensor, "*s E E"]]:
@@ -157,6 +163,18 @@ class InertialProcess(Process):
         q = rotate_by(q, u[..., 3:] * dt)
         return concat((p + (v + 0.5 * a * dt) * dt, v + a * dt, q, biases))
 
+    def retreat(
+        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 6"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s S"]:
+        p, v, q, biases = x[..., :3], x[..., 3:6], x[..., 6:10], x[..., 10:]
+        dt = dt.unsqueeze(-1)
+        if self.biased:
+            u = u - biases
+        q = rotate_by(q, -u[..., 3:] * dt)
+        a = rotate(q, u[..., :3]) - u.new_tensor((0.0, 0.0, GRAVITY))
+        v = v - a * dt
+        return concat((p - (v + 0.5 * a * dt) * dt, v, q, biases))
+
     def linearize(
         self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 6"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s E E"], Float[Tensor, "*s E E"]]:
@@ -230,6 +248,13 @@ class WheeledProcess(Process):
         velocity = torch.where(dt > 0, velocity, x[..., 2:4])
         return concat((position, velocity, rotate_by(x[..., 4:], u[..., 2:] * dt)))
 
+    def retreat(
+        self, x: Float[Tensor, "*s 5"], u: Float[Tensor, "*s 3"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s 5"]:
+        dt = dt.unsqueeze(-1)
+        heading = rotate_by(x[..., 4:], -u[..., 2:] * dt)
+        return concat((x[..., :2] - rotate(heading, u[..., :2]) * dt, x[..., 2:4], heading))
+
     def linearize(
         self, x: Float[Tensor, "*s 5"], u: Float[Tensor, "*s 3"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s 3 3"], Float[Tensor, "*s 3 3"]]:
@@ -254,12 +279,13 @@ class WheeledProcess(Process):
 
 class ConstantVelocityProcess(Process):
     """x = [p, v]; white acceleration, and optionally a pull of the velocity to zero
-    (Ornstein-Uhlenbeck, exactly discretized)."""
+    (Ornstein-Uhlenbeck, exactly discretized); or acceleration that is held over each step."""
 
     def __init__(self, dim: int, dt: float, settings: believed_processes.ConstantVelocity) -> None:
         super().__init__(dim, dt)
         self.settings = settings
-        self.state_size = self.error_size = self.noise_size = 2 * dim
+        self.state_size = self.error_size = 2 * dim
+        self.noise_size = dim if settings.held else 2 * dim
 
     def inputs(self, observation: Observation) -> Float[Tensor, "B N 0"]:
         return observation["prior"][..., :0].double()
@@ -269,6 +295,8 @@ class ConstantVelocityProcess(Process):
         density, damping = self.settings.accel_std**2, self.settings.damping
         if damping is None:
             one = torch.ones_like(dt)
+            if self.settings.held:
+                return one, dt, density * dt**4 / 4, density * dt**3 / 2, density * dt**2
             return one, dt, density * dt**3 / 3, density * dt**2 / 2, density * dt
         r = dt.double() / damping
         once, twice = torch.expm1(-r), torch.expm1(-2 * r)
@@ -285,7 +313,7 @@ class ConstantVelocityProcess(Process):
         x: Float[Tensor, "*s S"],
         u: Float[Tensor, "*s 0"],
         dt: Float[Tensor, "*s"],
-        noise: Float[Tensor, "*s S"] | None = None,
+        noise: Float[Tensor, "*s W"] | None = None,
     ) -> Float[Tensor, "*s S"]:
         d = self.dim
         decay, carry, pp, pv, vv = (c.unsqueeze(-1) for c in self._coefficients(dt))
@@ -293,10 +321,17 @@ class ConstantVelocityProcess(Process):
         if noise is not None:
             first = pp.sqrt()
             slope = torch.where(first > 0, pv / first.clamp_min(1e-30), torch.zeros_like(first))
-            p = p + first * noise[..., :d]
-            rest = (vv - slope**2).clamp_min(0).sqrt()
-            v = v + slope * noise[..., :d] + rest * noise[..., d:]
+            p, v = p + first * noise[..., :d], v + slope * noise[..., :d]
+            if not self.settings.held:
+                v = v + (vv - slope**2).clamp_min(0).sqrt() * noise[..., d:]
         return concat((p, v))
+
+    def retreat(
+        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 0"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s S"]:
+        decay, carry, *_ = (c.unsqueeze(-1) for c in self._coefficients(dt))
+        v = x[..., self.dim :] / decay
+        return concat((x[..., : self.dim] - carry * v, v))
 
     def linearize(
         self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 0"], dt: Float[Tensor, "*s"]

@@ -1,11 +1,17 @@
-"""A particle filter's belief, and the random numbers that are its UAV's own."""
+"""A particle filter's belief, what a step meets, and the random numbers that are its UAV's own."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.models.measurements import Neighbours
+from agents.robust import Trust
 from coloc_env import noise
+from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 
 
@@ -24,6 +30,25 @@ class ParticleBelief(TensorClass):
     last: Float32[Tensor, "B N 2*d"]
     memory: Float[Tensor, "B N K"]
 
+    def moved(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":
+        """Its position shifted by ``offset`` (m)."""
+        d, offset = offset.shape[-1], offset.to(torch.float32)
+        places = self.particles[..., :d] + offset.unsqueeze(-2)
+        last = torch.cat((self.last[..., :d] + offset, self.last[..., d:]), -1)
+        return self.replace(particles=concat((places, self.particles[..., d:])), last=last)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step meets: the belief before it, what is observed, what neighbours sent, how far each
+    model's measurements are trusted, and the UAVs' random keys for this step."""
+
+    belief: ParticleBelief
+    observation: Observation
+    neighbours: Neighbours
+    trusts: Sequence[Trust]
+    key: Int64[Tensor, "B N"]
+
 
 def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
     """One random key per UAV, from what its prior says and the localizer's seed: the same UAV in
@@ -34,9 +59,16 @@ def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
 
 
 def normal(
+    key: Int64[Tensor, "B N"], stream: str, components: int, slots: int, first: int = 0
+) -> Float32[Tensor, "B N M E"]:
+    """Standard normal numbers for each slot, whatever the number of slots beside it: the stream's
+    ``components`` from the ``first`` on; in the memory order of ``geometry.join``."""
+    which = torch.arange(first, first + components, device=key.device).view(-1, 1, 1)
+    return noise.normal(noise.fold(key, which), stream, slots).movedim(0, -1)
+
+
+def uniform(
     key: Int64[Tensor, "B N"], stream: str, components: int, slots: int
 ) -> Float32[Tensor, "B N M E"]:
-    """Standard normal numbers for each slot, whatever the number of slots beside it; in the memory
-    order of ``geometry.join``."""
-    which = torch.arange(components, device=key.device).view(-1, 1, 1)
-    return noise.normal(noise.fold(key, which), stream, slots).movedim(0, -1)
+    """Numbers in (0, 1), as ``normal`` gives normal ones."""
+    return (normal(key, stream, components, slots) * 0.5**0.5).erf() * 0.5 + 0.5

@@ -12,8 +12,8 @@ from agents.models.process import Process
 
 def effective_sample_size(log_weights: Float[Tensor, "*s M"]) -> Float[Tensor, "*s"]:
     """1 / Σ w² of the normalized weights."""
-    squared = torch.logsumexp(2 * log_weights.double().log_softmax(-1), -1)
-    return torch.exp(-squared).to(log_weights.dtype)
+    weights = (log_weights.double() - log_weights.amax(-1, keepdim=True)).exp_()
+    return (weights.sum(-1) ** 2 / weights.square().sum(-1)).to(log_weights.dtype)
 
 
 def normalized(log_weights: Float32[Tensor, "*s M"]) -> Float32[Tensor, "*s M"]:

@@ -7,6 +7,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from agents.models.measurements import (
+    AnchorRanges,
     Block,
     LandmarkVectors,
     Measurement,
@@ -105,11 +106,10 @@ def log_likelihood(
                 model, process, particles, centre, observation, trust
             )
             continue
-        if isinstance(model, UavRanges) and not model.tags:
+        if isinstance(model, UavRanges | AnchorRanges) and not model.tags:
             block = model.linearize(process, centre, observation, near, derivatives=False)
-            total = total + range_log_likelihood(
-                block, observation["ranges"], particles[..., :d], near.position, trust
-            )
+            ranges, points = model.ends(observation, near)
+            total = total + range_log_likelihood(block, ranges, particles[..., :d], points, trust)
             continue
         block = model.linearize(process, particles, wide, spread, derivatives=False)
         trust = _per_particle(trust, total.dtype)

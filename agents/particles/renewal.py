@@ -1,5 +1,6 @@
 """From a weighted cloud to the next step's particles: moments, resampling, counts that adapt."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -8,14 +9,8 @@ from torch import Tensor
 
 from agents.models.process import Process
 from agents.particles import population
-from agents.particles.cloud import (
-    Moments,
-    effective_sample_size,
-    liu_west,
-    moments,
-    normalized,
-    systematic,
-)
+from agents.particles.belief import normal
+from agents.particles.cloud import Moments, liu_west, moments, normalized, systematic
 from coloc_env import noise
 
 Perturb = Literal["liu_west", "fixed"]
@@ -27,6 +22,18 @@ FLOOR = {"position": 0.005, "velocity": 0.005, "attitude": 0.0015, "accel": 0.00
 _FIXED = {"position": 0.03, "velocity": 0.03, "attitude": 0.01, "accel": 0.01, "gyro": 0.001}
 
 
+@dataclass(frozen=True)
+class Weighed:
+    """A cloud after the evidence: normalized weights and their logarithms, moments, effective
+    sample size, and how many particles the next step gets."""
+
+    log_weights: Float32[Tensor, "B N M"]
+    weights: Float32[Tensor, "B N M"]
+    cloud: Moments
+    ess: Float32[Tensor, "B N"]
+    target: Int64[Tensor, "B N"]
+
+
 class Renewal:
     """PF-NN paper's Algorithm 2, with counts within ``bounds`` (None: they stay as they are)."""
 
@@ -35,43 +42,70 @@ class Renewal:
         self.shrink, std = (0.7, FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
         self.floor = torch.tensor(_per_error(process, std), dtype=torch.float64)
 
-    def conclude(
+    def weigh(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         count: Int64[Tensor, "B N"],
-        draws: Float32[Tensor, "B N M E"],
-        key: Int64[Tensor, "B N"],
-    ) -> tuple[
-        Float32[Tensor, "B N M S"],
-        Float32[Tensor, "B N M"],
-        Moments,
-        Float32[Tensor, "B N"],
-        Int64[Tensor, "B N"],
-    ]:
-        """Algorithm 2 but for shrinking: resampled particles where the effective sample size is
-        low, the cloud's moments before, that size, and the count adapted to it."""
-        log_weights = normalized(log_weights)
-        weights, ess = log_weights.exp(), effective_sample_size(log_weights)
+    ) -> Weighed:
+        """Algorithm 2's first part: moments, effective sample size, and the count adapted to it."""
+        exact = log_weights.double().log_softmax(-1)
+        ess = (1 / (2 * exact).exp_().sum(-1)).to(log_weights.dtype)
+        log_weights = exact.to(log_weights.dtype)
+        weights = log_weights.exp()
         cloud = moments(self.process, particles, weights)
         target = count if self.bounds is None else population.adapted(count, ess, self.bounds)
-        few = ess < RESAMPLE * count
-        moved = self.resample(cloud, weights, target, draws, key)
-        live = population.alive(torch.maximum(count, target), particles.shape[-2])
+        return Weighed(log_weights, weights, cloud, ess, target)
+
+    def renewed(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        weighed: Weighed,
+        count: Int64[Tensor, "B N"],
+        key: Int64[Tensor, "B N"],
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """The rest of Algorithm 2: the next step's particles and normalized log-weights, resampled
+        where few are effective, and as many as their count has become."""
+        log_weights = weighed.log_weights
+        if bool(self.few(weighed, count).any()):
+            size, first = self.process.error_size, self.process.noise_size
+            draws = normal(key, "pf.step", size, particles.shape[-2], first)
+            particles, log_weights = self.renew(particles, weighed, count, draws, key)
+        particles, log_weights = self.shrunk(particles, log_weights, weighed, count)
+        return self.buried(particles, weighed), log_weights
+
+    def renew(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        weighed: Weighed,
+        count: Int64[Tensor, "B N"],
+        draws: Float32[Tensor, "B N M E"],
+        key: Int64[Tensor, "B N"],
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+        """Algorithm 2 but for shrinking: particles drawn anew where the effective sample size is
+        low."""
+        few = self.few(weighed, count)
+        moved = self.resample(weighed.cloud, weighed.weights, weighed.target, draws, key)
+        live = population.alive(torch.maximum(count, weighed.target), particles.shape[-2])
         particles = torch.where(few[..., None, None], moved, particles)
         equal = population.equal_log_weights(live)
-        log_weights = torch.where(few.unsqueeze(-1), equal, log_weights)
-        return self._buried(particles, live, cloud.mean), log_weights, cloud, ess, target
+        log_weights = torch.where(few.unsqueeze(-1), equal, weighed.log_weights)
+        return particles, log_weights
+
+    @staticmethod
+    def few(weighed: Weighed, count: Int64[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
+        """Whose effective sample size is low."""
+        return weighed.ess < RESAMPLE * count
 
     def shrunk(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
-        cloud: Moments,
+        weighed: Weighed,
         count: Int64[Tensor, "B N"],
-        target: Int64[Tensor, "B N"],
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
         """Algorithm 2, shrinking: the heaviest stay where the count has fallen."""
+        target = weighed.target
         fewer = target < count
         if self.bounds is None or not bool(fewer.any()):
             return particles, log_weights
@@ -79,7 +113,7 @@ class Renewal:
         live = population.alive(target, particles.shape[-2])
         kept = normalized(kept.masked_fill(~live, -torch.inf))
         log_weights = torch.where(fewer.unsqueeze(-1), kept, log_weights)
-        return self._buried(particles, live, cloud.mean), log_weights
+        return particles, log_weights
 
     def resample(
         self,
@@ -94,16 +128,14 @@ class Renewal:
         floor = self.floor.to(draws.device)
         return liu_west(self.process, cloud, ancestors, draws, self.shrink, floor)
 
-    def _buried(
-        self,
-        particles: Float32[Tensor, "B N M S"],
-        live: Bool[Tensor, "B N M"],
-        mean: Float32[Tensor, "B N S"],
+    def buried(
+        self, particles: Float32[Tensor, "B N M S"], weighed: Weighed
     ) -> Float32[Tensor, "B N M S"]:
         """Dead particles all at the mean, whatever they were."""
         if self.bounds is None:
             return particles
-        return torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2))
+        live = population.alive(weighed.target, particles.shape[-2])
+        return torch.where(live.unsqueeze(-1), particles, weighed.cloud.mean.unsqueeze(-2))
 
 
 def padded_weights(log_weights: Float32[Tensor, "B N m"], slots: int) -> Float32[Tensor, "B N M"]:

@@ -1,15 +1,26 @@
-"""How much of a likelihood to use at once: increments that keep enough particles alive."""
+"""Adaptive tempering: evidence that is used in stages, each as large as keeps particles alive."""
 
 import math
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from agents.particles.cloud import effective_sample_size
+from agents.particles import population
+from agents.particles.belief import Step, normal
+from agents.particles.cloud import effective_sample_size, moments, normalized
+from agents.particles.renewal import RESAMPLE, Renewal
+from coloc_env import noise
+
+# What a step says of particles, given their log-weights (the heaviest is where it is linearized).
+Evidence = Callable[
+    [Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]], Float32[Tensor, "B N M"]
+]
 
 _BISECTIONS = 10
 _SMALLEST = math.log(1e-9)  # of what is left: no likelihood is sharper than that
+_STAGES = 40  # more than any likelihood has needed
 
 
 def increment(
@@ -31,3 +42,39 @@ def increment(
         good = enough(left * middle.exp())
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
     return torch.where(enough(left), left, left * low.exp())
+
+
+def tempered(
+    particles: Float32[Tensor, "B N M S"],
+    log_weights: Float32[Tensor, "B N M"],
+    gain: Float32[Tensor, "B N M"],
+    staged: Bool[Tensor, "B N"],
+    evidence: Evidence,
+    renewal: Renewal,
+    now: Step,
+) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+    """The evidence in stages for some UAVs, w ← w exp(β gain) with Σβ = 1 and a resampling move
+    between stages; at once for the others. ``gain`` is the evidence about the particles given."""
+    count = now.belief.count
+    equal = population.equal_log_weights(population.alive(count, particles.shape[-2]))
+    left = torch.ones_like(gain[..., 0])
+    for stage in range(_STAGES):
+        share = left
+        if stage < _STAGES - 1:
+            some = increment(log_weights, gain, left, RESAMPLE * count)
+            share = torch.where(staged, some, left)
+        used = normalized(log_weights + share.unsqueeze(-1) * gain)
+        log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)
+        left = left - share
+        go_on = left > 0
+        if not bool(go_on.any()):
+            break
+        weights = log_weights.exp()
+        key = noise.fold(now.key, stage)
+        draws = normal(key, "pf.move", renewal.process.error_size, weights.shape[-1])
+        cloud = moments(renewal.process, particles, weights)
+        moved = renewal.resample(cloud, weights, count, draws, key)
+        particles = torch.where(go_on[..., None, None], moved, particles)
+        log_weights = torch.where(go_on.unsqueeze(-1), equal, log_weights)
+        gain = evidence(particles, log_weights)
+    return particles, log_weights

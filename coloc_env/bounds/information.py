@@ -9,6 +9,7 @@ function here: ``own_information`` [B, N, D, D] for what one UAV measures of the
 For z = h(x) + noise each contributes Hᵀ R⁻¹ H (Kay 1993, eq. 3.31), R the *true* noise.
 """
 
+from dataclasses import replace
 from functools import singledispatch
 
 import torch
@@ -91,7 +92,10 @@ def _anchor_ranging(
     tags, jacobian = _tags(truth, sensor.tags)
     toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
     rows = toward @ jacobian  # [B, N, T, A, D]
-    weights = arrived * range_information(sensor.noise)
+    told = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
+    if sensor.blocked:
+        told[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
+    weights = arrived * told
     return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
 
 

@@ -41,7 +41,7 @@ from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.information import SHARED
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
-from coloc_env.motion import Kinematics
+from coloc_env.motion import Kidnapped, Kinematics
 from coloc_env.observation import Observation, action_width
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
@@ -90,6 +90,8 @@ def posterior_bound(
     ``steps``: how many of the scenario's (default: all). ``cooperative=False`` leaves out whatever
     is measured between UAVs.
     """
+    if isinstance(scenario.motion, Kidnapped):
+        raise ValueError("posterior_bound: no bound is known for a team that is kidnapped")
     steps = scenario.horizon if steps is None else steps
     if runs < 1 or not 1 <= steps <= scenario.horizon:
         raise ValueError(

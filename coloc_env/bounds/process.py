@@ -56,7 +56,7 @@ class InertialErrors(ErrorModel):
         return self.imu.accel_bias > 0 or self.imu.gyro_bias > 0
 
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
-        motion = [*position, *3 * [prior.velocity_std], *3 * [prior.attitude_std]]
+        motion = [*position, *3 * [prior.velocity_spread], *3 * [prior.attitude_std]]
         biases = [*3 * [self.imu.accel_bias], *3 * [self.imu.gyro_bias]]
         return motion + biases * self.biased
 
@@ -105,12 +105,13 @@ class WheeledErrors(ErrorModel):
 @dataclass(frozen=True)
 class ConstantVelocityErrors(ErrorModel):
     """(δp, δv): ṗ = v, v̇ = −v/τ + white noise, integrated exactly over a step (with damping the
-    integrated Ornstein–Uhlenbeck process). Attitude, where a sensor needs it, counts as known."""
+    integrated Ornstein–Uhlenbeck process), or noise that is held over the step. Attitude, where a
+    sensor needs it, counts as known."""
 
     process: ConstantVelocity
 
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
-        return [*position, *self.dim * [prior.velocity_std]]
+        return [*position, *self.dim * [prior.velocity_spread]]
 
     def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
         rate = 1 / self.process.damping if self.process.damping else 0.0
@@ -118,7 +119,11 @@ class ConstantVelocityErrors(ErrorModel):
         drive = torch.tensor(((0.0, 0.0), (0.0, self.process.accel_std**2)), dtype=torch.float64)
         axes = torch.eye(self.dim, dtype=torch.float64)
         shape = (*now.position.shape[:2], 2 * self.dim, 2 * self.dim)
-        f, q = (torch.kron(x, axes).to(now.position) for x in discretise(system, drive, self.dt))
+        f, q = discretise(system, drive, self.dt)
+        if self.process.held:
+            gain = self.process.accel_std * torch.tensor((0.5 * self.dt**2, self.dt)).double()
+            q = gain.outer(gain)
+        f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
         return f.expand(shape), q.expand(shape)
 
     def pose(self) -> Float64[Tensor, "D E"]:

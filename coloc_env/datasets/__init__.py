@@ -1,17 +1,20 @@
-"""Real recordings: MRCLAM, EuRoC and MILUV, read from the owners' files into one form."""
+"""Real recordings, read from the owners' files into one form."""
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from coloc_env.datasets import euroc, miluv, mrclam
+from coloc_env.datasets import euroc, hanyang, miluv, mrclam, tuc
 from coloc_env.datasets.euroc import load_euroc
 from coloc_env.datasets.files import DataError, data_root, dataset_folder
+from coloc_env.datasets.hanyang import load_hanyang
 from coloc_env.datasets.miluv import load_miluv
 from coloc_env.datasets.mrclam import load_mrclam
 from coloc_env.datasets.recording import Recording, Table, Track
+from coloc_env.datasets.tuc import load_tuc
 
 __all__ = [
     "DATASETS",
@@ -22,17 +25,41 @@ __all__ = [
     "data_root",
     "load",
     "load_euroc",
+    "load_hanyang",
     "load_miluv",
     "load_mrclam",
+    "load_tuc",
     "sequences",
 ]
 
-_ROBOTS_IN: dict[str, Callable[[Path], tuple[str, ...]]] = {
-    "mrclam": mrclam.robots_in,
-    "euroc": euroc.robots_in,
-    "miluv": miluv.robots_in,
+
+@dataclass(frozen=True)
+class _Dataset:
+    """Its loader, and which sequences a folder holds: their names and numbers of robots."""
+
+    load: Callable[..., Recording]
+    sequences_in: Callable[[Path], dict[str, int]]
+
+
+def _folders(robots_in: Callable[[Path], tuple[str, ...]]) -> Callable[[Path], dict[str, int]]:
+    """A folder per sequence, which ``robots_in`` tells from others."""
+
+    def sequences_in(home: Path) -> dict[str, int]:
+        folders = sorted(path for path in home.iterdir() if path.is_dir())
+        robots = {folder.name: len(robots_in(folder)) for folder in folders}
+        return {name: count for name, count in robots.items() if count}
+
+    return sequences_in
+
+
+_DATASETS = {
+    "mrclam": _Dataset(load_mrclam, _folders(mrclam.robots_in)),
+    "euroc": _Dataset(load_euroc, _folders(euroc.robots_in)),
+    "miluv": _Dataset(load_miluv, _folders(miluv.robots_in)),
+    "tuc": _Dataset(load_tuc, tuc.sequences_in),
+    "hanyang": _Dataset(load_hanyang, hanyang.sequences_in),
 }
-DATASETS = tuple(_ROBOTS_IN)
+DATASETS = tuple(_DATASETS)
 
 
 def load(
@@ -45,27 +72,27 @@ def load(
 
     Args:
         name: one of DATASETS.
-        sequence: the sequence's folder; for euroc several, with commas between them, make a team.
-            By default the sequence with the most robots, for euroc all of the room with the most
-            sequences; the first by name among equals.
+        sequence: one of :func:`sequences`; for euroc several, with commas between them, make a
+            team. By default the sequence with the most robots, for euroc all of the room with the
+            most sequences; the first by name among equals.
         data: the data folder, see :func:`data_root`.
         options: handed on to the dataset's loader.
 
     Raises:
         DataError: an unknown dataset or sequence, or files that are missing or damaged.
     """
-    found = sequences(name, data)
+    found = _found(name, data)
     folder = dataset_folder(name, data)
     wanted = sequence.split(",") if sequence else _largest(name, folder, found)
     for each in wanted:
         if each not in found:
             known = ", ".join(found) or "none"
             raise DataError(f"no sequence {each!r} in {folder}, there are: {known}")
+    loader = _DATASETS[name].load
     if name == "euroc":
-        return load_euroc([folder / each for each in wanted], **options)
+        return loader([folder / each for each in wanted], **options)
     if len(wanted) != 1:
         raise DataError(f"{name} is loaded one sequence at a time, not {sequence}")
-    loader = load_mrclam if name == "mrclam" else load_miluv
     return loader(folder / wanted[0], **options)
 
 
@@ -75,15 +102,19 @@ def sequences(name: str, data: str | os.PathLike[str] | None = None) -> tuple[st
     Raises:
         DataError: an unknown dataset, or no folder for it.
     """
-    if name not in _ROBOTS_IN:
+    return tuple(_found(name, data))
+
+
+def _found(name: str, data: str | os.PathLike[str] | None) -> dict[str, int]:
+    """The sequences that are there, and the number of robots of each."""
+    if name not in _DATASETS:
         raise DataError(f"no dataset {name!r}, there are: {', '.join(DATASETS)}")
-    folders = sorted(path for path in dataset_folder(name, data).iterdir() if path.is_dir())
-    return tuple(folder.name for folder in folders if _ROBOTS_IN[name](folder))
+    return _DATASETS[name].sequences_in(dataset_folder(name, data))
 
 
-def _largest(name: str, folder: Path, found: tuple[str, ...]) -> list[str]:
+def _largest(name: str, folder: Path, found: dict[str, int]) -> list[str]:
     if not found:
         raise DataError(f"no sequence of {name} in {folder}")
     if name == "euroc":
         return max((list(team) for _, team in groupby(found, euroc.room)), key=len)
-    return [max(found, key=lambda each: len(_ROBOTS_IN[name](folder / each)))]
+    return [max(found, key=lambda each: found[each])]

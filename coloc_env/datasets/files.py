@@ -21,7 +21,10 @@ HOMES = {
     "mrclam": "http://asrl.utias.utoronto.ca/datasets/mrclam/",
     "euroc": "https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets",
     "miluv": "https://github.com/decargroup/miluv",
+    "tuc": "https://github.com/TUC-ProAut/libRSF",
+    "hanyang": "https://doi.org/10.5281/zenodo.15226105",
 }
+_FOLDERS = {"tuc": "tuc_indoor_uwb", "hanyang": "hanyang_outdoor_uwb"}  # where not the name
 _CACHE_VERSION = 1
 
 
@@ -58,14 +61,14 @@ def dataset_folder(name: str, data: str | os.PathLike[str] | None = None) -> Pat
     Raises:
         DataError: there is no such folder.
     """
-    folder = data_root(data) / name
+    folder = data_root(data) / _FOLDERS.get(name, name)
     if not folder.is_dir():
         raise DataError(f"no recordings in {folder}: {_remedy(name)}")
     return folder
 
 
 def _remedy(*names: str) -> str:
-    homes = ", ".join(f"{name}/ (from {HOMES[name]})" for name in names)
+    homes = ", ".join(f"{_FOLDERS.get(name, name)}/ (from {HOMES[name]})" for name in names)
     return f"set COLOC_DATA or --data to the folder that holds {homes}"
 
 
@@ -76,12 +79,15 @@ class FileFormat:
     Attributes:
         columns: names of the numeric columns wanted, the stamp not among them. Without
             ``header`` they are all that the file has, in this order, after the stamp.
-        stamp: how times are written: decimal seconds since 1970, whole nanoseconds since 1970,
-            seconds since a zero of the recording; None for a file without times.
+        stamp: how times are written: decimal seconds since 1970, whole nanoseconds since 1970
+            (also as 1.7e+18), seconds since a zero of the recording; None for a file without times.
         delimiter: None for white space.
         header: the first line names the columns, and others may stand among those wanted; the
-            stamp is ``timestamp``. Otherwise ``#`` starts a comment.
+            stamp is ``stamp_column``. Otherwise ``#`` starts a comment.
         whole: those of ``columns`` that hold whole numbers.
+        stamp_column: the stamp's name in a header.
+        words: every line begins with one of these words, and those with the first are the rows;
+            none: all lines are rows, and begin with their stamp.
     """
 
     columns: tuple[str, ...]
@@ -89,11 +95,13 @@ class FileFormat:
     delimiter: str | None = None
     header: bool = False
     whole: tuple[str, ...] = ()
+    stamp_column: str = "timestamp"
+    words: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """The wanted columns, the stamp first."""
-        return (("timestamp",) if self.stamp else ()) + self.columns
+        return ((self.stamp_column,) if self.stamp else ()) + self.columns
 
 
 class Rows(NamedTuple):
@@ -162,12 +170,12 @@ def _parse(path: Path, form: FileFormat) -> Rows:
 def _load(path: Path, form: FileFormat) -> NDArray[np.void]:
     """Every column of the file, those not wanted cut to a byte, so that all rows are checked."""
     kinds = dict.fromkeys(form.columns, "f8")
-    kinds["timestamp"] = "f8" if form.stamp == "relative seconds" else "S32"
-    names = _header(path, form) if form.header else form.names
+    kinds[form.stamp_column] = "f8" if form.stamp == "relative seconds" else "S32"
+    names = _names(path, form)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*contained no data", UserWarning)
         return np.loadtxt(
-            path,
+            list(_marked(path, form)) if form.words else path,
             dtype=[(name or f"column {i}", kinds.get(name, "S1")) for i, name in enumerate(names)],
             comments=None if form.header else "#",
             delimiter=form.delimiter,
@@ -176,6 +184,25 @@ def _load(path: Path, form: FileFormat) -> NDArray[np.void]:
             encoding="utf-8",
             ndmin=1,
         )
+
+
+def _marked(path: Path, form: FileFormat) -> Iterator[str]:
+    """The lines that begin with the format's first word."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            word = next(iter(line.split("#")[0].split()), None)
+            if word is not None and word not in form.words:
+                known = " or ".join(form.words)
+                raise DataError(f"{path}, line {number}: begins with {word[:40]!r}, not {known}")
+            if word == form.words[0]:
+                yield line
+
+
+def _names(path: Path, form: FileFormat) -> list[str]:
+    """A name for each column of the file, empty or not among those wanted where it is not read."""
+    if form.header:
+        return _header(path, form)
+    return [""] * bool(form.words) + list(form.names)
 
 
 def _header(path: Path, form: FileFormat) -> list[str]:
@@ -193,18 +220,24 @@ def _time(path: Path, form: FileFormat, table: NDArray[np.void]) -> Stamps:
     """Nanoseconds; stamps since 1970 from their decimal text, since a float would round them."""
     if form.stamp is None:
         return np.zeros(len(table), np.int64)
-    stamp = table["timestamp"]
+    stamp = table[form.stamp_column]
     if form.stamp == "relative seconds":
         bad = ~(np.abs(stamp) < 9e6)  # beyond, a float is not exact to the nanosecond
         if bad.any():
             fail(path, form, bad, f"the time is {stamp[bad][0]:g}, not {form.stamp}")
         return np.rint(1e9 * stamp).astype(np.int64)
-    digits, point, fraction = np.strings.partition(stamp, np.bytes_(b"."))
+    plain, power, rest = np.strings.partition(stamp, np.bytes_(b"e+18"))
+    digits, point, fraction = np.strings.partition(plain, np.bytes_(b"."))
+    powered = np.strings.str_len(power) > 0
+    bad = np.strings.str_len(rest) > 0
     if form.stamp == "seconds":
-        bad = np.strings.str_len(fraction) > 9
+        bad |= powered | (np.strings.str_len(fraction) > 9)
         digits = np.strings.add(digits, np.strings.ljust(fraction, 9, np.bytes_(b"0")))
     else:
-        bad = np.strings.str_len(point) > 0
+        bad |= (np.strings.str_len(point) > 0) & ~powered
+        bad |= (np.strings.str_len(digits) > 1) & powered
+        decimals = np.strings.ljust(fraction, 18, np.bytes_(b"0"))
+        digits = np.where(powered, np.strings.add(digits, decimals), digits)
     length = np.strings.str_len(digits)
     bad |= ~np.strings.isdigit(digits) | (length > 19) | ((length == 19) & (digits >= b"9"))
     if bad.any():
@@ -223,12 +256,14 @@ def _lines(path: Path, form: FileFormat) -> Iterator[tuple[int, list[str]]]:
         else:
             for number, line in enumerate(file, 1):
                 if content := line.split("#")[0].strip():
-                    yield number, content.split(form.delimiter)
+                    fields = content.split(form.delimiter)
+                    if not form.words or fields[0] == form.words[0]:
+                        yield number, fields
 
 
 def _explain(path: Path, form: FileFormat, error: ValueError) -> NoReturn:
     """Find the line that numpy could not parse."""
-    names = _header(path, form) if form.header else form.names
+    names = _names(path, form)
     with contextlib.suppress(csv.Error):
         for line, fields in _lines(path, form):
             where = f"{path}, line {line}"

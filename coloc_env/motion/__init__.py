@@ -9,6 +9,7 @@ from coloc_env.motion.aggressive import Aggressive
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
 from coloc_env.motion.curves import Circle, FigureEight, Helix
 from coloc_env.motion.formation import FormationChange
+from coloc_env.motion.kidnapped import Kidnapped
 from coloc_env.motion.lanes import Line, Square
 from coloc_env.motion.random_circles import RandomCircles
 from coloc_env.motion.random_velocity import RandomVelocity
@@ -39,6 +40,7 @@ __all__ = [
     "FigureEight",
     "FormationChange",
     "Helix",
+    "Kidnapped",
     "Kinematics",
     "Line",
     "Motion",

@@ -20,13 +20,15 @@ class Kinematics:
 
     ``position`` in metres and ``velocity`` in m/s in the world frame; ``attitude`` is a unit
     quaternion wxyz, body to world (d = 3), or a heading in rad (d = 2). ``valid`` marks where a
-    recording has truth to score against (None: everywhere).
+    recording has truth to score against (None: everywhere), ``carried`` the steps at which a UAV
+    was put somewhere else (None: never).
     """
 
     position: Float64[Tensor, "R K N d"]
     velocity: Float64[Tensor, "R K N d"]
     attitude: Float64[Tensor, "R K N a"]
     valid: Bool[Tensor, "R K N"] | None = None
+    carried: Bool[Tensor, "R K N"] | None = None
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from typing import Literal
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Process, Scenario
+from coloc_env.scenarios.parts import anchor_places, blocked_anchors, kidnapped_at
 from coloc_env.scenarios.registry import register
 from coloc_env.sensors import AnchorRanging, Imu, Landmarks, RangeNoise, Ranging, Sensor
-from coloc_env.sensors.base import require
 
 
 @register("indoor-v0")
@@ -36,6 +36,7 @@ def indoor(
     uwb_dropout: float = 0.0,
     uwb_delay: int = 0,
     anchors: int = 0,
+    nlos_anchor: int | None = None,
     accel_std: float = 0.05,
     gyro_std: float = 0.01,
     imu: bool = True,
@@ -47,6 +48,8 @@ def indoor(
     message_loss: float = 0.0,
     message_delay: int = 0,
     walls: tuple[float, ...] | None = None,
+    kidnap_at: float | None = None,
+    kidnapped: tuple[int, ...] | None = None,
     prior: str = "gaussian",
     prior_std: float = 2.0,
     failure_rate: float = 0.0,
@@ -59,8 +62,10 @@ def indoor(
     The team believes the Gaussian parts of the sensors: contamination (NLOS, tails, impulses, false
     matches) and, unless ``believed_imu_bias``, nothing of it. ``range_only="40:60"`` takes all
     landmarks away in those seconds; ``anchors`` puts that many UWB anchors into the room's corners
-    and along its walls; ``walls`` are boxes ``x0,y0,z0,x1,y1,z1`` (several: one after the other)
-    that block links; ``imu=false`` leaves a constant-velocity model.
+    and along its walls, every range to number ``nlos_anchor`` NLOS; ``walls`` are boxes
+    ``x0,y0,z0,x1,y1,z1`` (several: one after the other) that block links; ``imu=false`` leaves a
+    constant-velocity model; at ``kidnap_at`` s the UAVs of ``kidnapped`` (default: all) are put on
+    the room's other side.
     """
     name = "indoor-v0"
     if motion not in MOTIONS:
@@ -110,13 +115,13 @@ def indoor(
         believed.append(Ranging(assumed_error, latency=uwb_delay))
     if anchors:
         places = anchor_places(anchors, room)
-        true.append(AnchorRanging(places, error))
+        true.append(AnchorRanging(places, error, blocked=blocked_anchors(nlos_anchor)))
         believed.append(AnchorRanging(places, assumed_error))
     return Scenario(
         name=name,
         arena=arena,
         horizon=horizon,
-        motion=MOTIONS[motion],
+        motion=kidnapped_at(MOTIONS[motion], kidnap_at, kidnapped, dt),
         sensors=tuple(true),
         network=Network(comm_radius, _boxes(walls), message_loss, message_delay, max_neighbours),
         prior=Prior(position_std=prior_std, kind=prior),
@@ -125,17 +130,6 @@ def indoor(
         failure_rate=failure_rate,
         reward=reward,
     )
-
-
-def anchor_places(
-    count: int, room: tuple[float, float, float]
-) -> tuple[tuple[float, float, float], ...]:
-    """Anchors in the room's corners, alternately low and high, then at the middles of its walls."""
-    x, y, z = room
-    floor = [(0, 0), (1, 1), (1, 0), (0, 1), (0.5, 0), (0.5, 1), (0, 0.5), (1, 0.5)]
-    require(count <= 2 * len(floor), "indoor-v0", "anchors", f"at most {2 * len(floor)}")
-    corners = [(a * x, b * y, z * (i % 2)) for i, (a, b) in enumerate(floor)]
-    return tuple(corners + [(a, b, z - c) for a, b, c in corners])[:count]
 
 
 def _boxes(

@@ -59,7 +59,8 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
 
 
 @lru_cache(maxsize=4)
-def _loaded(name: str, sequence: str | None, data: str | None) -> Recording:
+def loaded(name: str, sequence: str | None, data: str | None) -> Recording:
+    """A recording, kept for the next scenario made of it."""
     return load(name, sequence, data)
 
 
@@ -89,7 +90,7 @@ def replay_mrclam(
     """
     if odometry_delay < 0 or odometry_scale <= 0:
         raise ValueError("odometry_delay is a time in s ≥ 0, odometry_scale a factor > 0")
-    recording = _loaded("mrclam", sequence, data)
+    recording = loaded("mrclam", sequence, data)
     grid = cut(common_grid(recording, dt, ("odometry",)), span)
     odometry = Odometry(forward_std, 0.5 * forward_std, turn_std, odometry_relative)
     landmarks = LandmarkBearings(len(recording.landmarks), range_std, bearing_std)
@@ -147,7 +148,7 @@ def replay_euroc(
     """
     if landmarks < 0:
         raise ValueError(f"landmarks={landmarks} is not allowed: a count ≥ 0")
-    recording = _loaded("euroc", sequence, data)
+    recording = loaded("euroc", sequence, data)
     grid = cut(common_grid(recording, dt, ("imu",)), span)
     imu = Imu(accel_std, gyro_std)
     bias = np.tile(_EUROC_BIAS, (len(recording.robots), 1))
@@ -209,10 +210,13 @@ def replay_miluv(
     and nothing else that bounds its horizontal position: strapdown integration alone diverges. The
     team therefore believes that nobody flies fast for long (``slow_flight``, see ``SlowFlight``).
     ``process="constant_velocity"`` leaves the IMU out: velocity driven by ``velocity_accel_std``,
-    damped over ``damping`` s. The flight is too short to tune on one part and score on another: the
-    noise settings were chosen on all of it, and the result is flat around them.
+    damped over ``damping`` s; the sequences without IMU need it. The flight is too short to tune on
+    one part and score on another: the noise settings were chosen on all of it, and the result is
+    flat around them.
     """
-    recording = _loaded("miluv", sequence, data)
+    recording = loaded("miluv", sequence, data)
+    if process == "inertial" and "imu" not in recording.streams:
+        raise ValueError(f"{recording.name} has no IMU: process=constant_velocity does without")
     drivers = ("imu",) if process == "inertial" else ()
     grid = cut(common_grid(recording, dt, drivers), span)
     tags = lever_arms(recording)

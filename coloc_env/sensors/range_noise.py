@@ -44,9 +44,14 @@ class RangeNoise:
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
 
     def sample(
-        self, distance: Float32[Tensor, "*s"], keys: Int64[Tensor, "*s"], stream: str
+        self,
+        distance: Float32[Tensor, "*s"],
+        keys: Int64[Tensor, "*s"],
+        stream: str,
+        blocked: Bool[Tensor, "*#s"] | None = None,
     ) -> tuple[Float32[Tensor, "*s"], Bool[Tensor, "*s"] | None]:
-        """Ranges in m and which of them were lost (None: none can be)."""
+        """Ranges in m and which of them were lost (None: none can be); the bias of ``nlos`` always
+        strikes links that are ``blocked``."""
 
         def chance(probability: float, name: str) -> Tensor:
             return noise.uniform(keys, f"{stream}.{name}", 1)[..., 0] < probability
@@ -61,11 +66,13 @@ class RangeNoise:
             error = error * self.std
         if self.uniform:
             error = error + (2 * draw("uniform") - 1) * self.uniform
-        if self.nlos:
+        if self.nlos or blocked is not None:
             size = torch.full_like(error, self.nlos_bias)
             if self.nlos_kind == "exponential":
                 size = size * -draw("nlos.size").log()
-            error = error + torch.where(chance(self.nlos, "nlos"), size, 0.0)
+            late = chance(self.nlos, "nlos")
+            late = late if blocked is None else late | blocked
+            error = error + torch.where(late, size, 0.0)
         if self.impulse:
             size = (2 * draw("impulse.size") - 1) * self.impulse_size
             error = error + torch.where(chance(self.impulse, "impulse"), size, 0.0)

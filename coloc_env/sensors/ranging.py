@@ -95,15 +95,20 @@ class AnchorRanging(Sensor):
     """Leaves ``anchor_ranges`` and ``anchor_range_mask`` [T · A], and ``anchor_map`` [A · d].
 
     Entry ``a · A + m`` is between the UAV's own tag ``a`` and anchor ``m``, within ``radius`` m.
+    ``blocked``: indices of anchors behind an obstacle, whose ranges all carry the noise's NLOS
+    bias.
     """
 
     anchors: tuple[tuple[float, ...], ...]
     noise: RangeNoise = field(default_factory=RangeNoise)
     tags: Tags = ()
     radius: float | None = None
+    blocked: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         require(len(self.anchors) > 0, self, "anchors", "at least one anchor position")
+        known = all(0 <= anchor < len(self.anchors) for anchor in self.blocked)
+        require(known, self, "blocked", f"indices of the {len(self.anchors)} anchors")
         require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
 
     @property
@@ -134,7 +139,11 @@ class AnchorRanging(Sensor):
         count = distance.shape[-3] * distance.shape[-2] * distance.shape[-1]
         index = torch.arange(count, device=distance.device).view(distance.shape[-3:])
         link = noise.fold(window.keys[..., None, None, None], index)
-        ranges, lost = self.noise.sample(distance, link, "anchor_ranging")
+        blocked = None
+        if self.blocked:
+            blocked = torch.zeros(len(self.anchors), dtype=torch.bool, device=distance.device)
+            blocked[list(self.blocked)] = True
+        ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked)
         mask = window.alive[..., None, None].expand(ranges.shape)
         if self.radius is not None:
             mask = mask & (distance <= self.radius)

@@ -76,6 +76,7 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "slots": indoor(n_uavs=20),
     "plane": plane,
     "tags": tags,
+    "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, dropout=0.2),
 }
 ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
@@ -91,13 +92,22 @@ VARIANTS = (
     "pf500:perturb=fixed:tempering=false",
 )
 REFUSED = {("ekf_joint", "slots")}
-TWINS = ("pf800", "ippo", "sb3-ppo")  # of pf500 and mappo, but for what is set here
+TWINS = ("pf", "pf800", "ippo", "sb3-ppo")  # of pf500 and mappo, but for what is set here
+# Those that need anchors, or take their time over many landmarks.
+CHOSEN = {
+    "emvf": ("few", "anchors", "plane", "tags", "wsn"),
+    "hpff": ("anchors", "tags", "wsn"),
+    "nnhpff": ("anchors", "tags", "wsn"),
+}
+ELSEWHERE = [f for f in FAMILIES if f != "wsn"]
 CASES = [
-    *((n, f) for n in LOCALIZERS for f in FAMILIES if (n, f) not in REFUSED and n not in TWINS),
+    *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE) if n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
+    *((n, "wsn") for n in ("pf", "ekf")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]
+CASES = [case for case in CASES if case not in REFUSED]
 
 
 @dataclass(frozen=True)
@@ -133,7 +143,15 @@ def build(name: str, scenario: Scenario) -> Localizer:
         few["bounds"] = (PARTICLES - 10, PARTICLES + 20)
     if "weights" in known:
         few["weights"] = "none"
+    if "main" in known:
+        few["main"] = f"pf@particles={PARTICLES}"
     return make(name, scenario, **few)
+
+
+def room(name: str, **overrides: Any) -> Scenario:
+    """``indoor-v0``; for those that need anchors, among anchors alone."""
+    among: dict[str, Any] = {"anchors": 8, "landmarks": 0} if name in CHOSEN else {}
+    return make_scenario("indoor-v0", **among, **overrides)
 
 
 def play(localizer: Localizer, scenario: Scenario, seeds: Iterable[int], steps: int) -> Run:
@@ -303,6 +321,7 @@ def tools() -> SimpleNamespace:
     """Running localizers and changing what they see."""
     return SimpleNamespace(
         build=build,
+        room=room,
         play=play,
         replay=replay,
         cloud=cloud,

@@ -1,9 +1,13 @@
 """Motion models: errors, their transition by finite differences, their noise by sampling."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
+from filterpy.common import Q_discrete_white_noise
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from agents.models.process import (
@@ -13,9 +17,11 @@ from agents.models.process import (
     WheeledProcess,
     make_process,
 )
-from coloc_env.motion import Aggressive, Arena, RandomVelocity
+from coloc_env.bounds.process import error_model
+from coloc_env.motion import Aggressive, Arena, Kinematics, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Scenario, Wheeled
+from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import GRAVITY, Imu, Odometry, Sensor
 from coloc_env.world import World
 
@@ -30,6 +36,7 @@ PROCESSES: dict[str, Callable[[], Process]] = {
     "velocity": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7)),
     "plane": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7)),
     "damped": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7, damping=0.4)),
+    "held": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7, held=True)),
 }
 INERTIAL = ("inertial", "biased", "walking")
 
@@ -44,9 +51,9 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=g, dtype=torch.float64)
 
 
-def states(process: Process, count: int = 50) -> Tensor:
+def states(process: Process, count: int = 50, seed: int = 0) -> Tensor:
     """[1, count, S]: places, velocities, any attitude, biases."""
-    x = normal(1, count, process.state_size)
+    x = normal(1, count, process.state_size, seed=seed)
     if process.attitude_size == 4:
         x[..., 6:10] = torch.nn.functional.normalize(x[..., 6:10], dim=-1)
     if process.attitude_size == 1:
@@ -54,10 +61,10 @@ def states(process: Process, count: int = 50) -> Tensor:
     return x
 
 
-def inputs(process: Process, count: int = 50) -> Tensor:
+def inputs(process: Process, count: int = 50, seed: int = 1) -> Tensor:
     """[1, count, U]: hard manoeuvres, with gravity where it is felt."""
     width = {4: 6, 1: 3, 0: 0}[process.attitude_size]
-    u = normal(1, count, width, seed=1)
+    u = normal(1, count, width, seed=seed)
     if width == 6:
         u[..., 2] += GRAVITY
     return u
@@ -131,6 +138,27 @@ def test_no_time_no_change(process: Process) -> None:
     assert not q.any()
 
 
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**31), size=st.floats(0.1, 30), push=st.floats(0, 5), dt=st.floats(0, 1)
+)
+def test_retreat_and_motion_undo_each_other(
+    process: Process, seed: int, size: float, push: float, dt: float
+) -> None:
+    """Wherever, however fast, with whatever biases, and however long."""
+    x, u = states(process, seed=seed), push * inputs(process, seed=seed + 1)
+    x[..., : 2 * process.dim] *= size
+    x[..., 10:] *= push
+    span = seconds(x, dt)
+    back = process.propagate(process.retreat(x, u, span), u, span)
+    forth = process.retreat(process.propagate(x, u, span), u, span)
+    rounding = 1e-12 * (1 + size + push)
+    assert process.boxminus(back, x).abs().max() < rounding
+    assert process.boxminus(forth, x).abs().max() < rounding
+
+
 # ---------------------------------------------------------------- noise
 
 
@@ -181,6 +209,54 @@ def test_damped_velocity_against_the_matrix_exponential(damping: float, dtype: t
     torch.testing.assert_close(q[0, 0].double(), expected, rtol=tolerance, atol=1e-18)
     moved = process.propagate(x, inputs(process, 1), seconds(x), torch.ones_like(x))
     assert moved.isfinite().all()
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.02, 1.5])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("q", [0.0, 0.0036, 1.0])
+def test_held_acceleration_is_filterpys_and_that_of_the_bound(
+    q: float, dim: int, dt: float
+) -> None:
+    """x₊ = F x + G w with G = [T²/2, T], w the acceleration of the whole step."""
+    model = ConstantVelocity(q**0.5, held=True)
+    process = ConstantVelocityProcess(dim, dt, model)
+    x = states(process, 3)
+    f, found = process.linearize(x, x[..., :0], seconds(x, dt))
+    expected = Q_discrete_white_noise(2, dt, q, block_size=dim, order_by_dim=False)
+    transition = torch.kron(torch.tensor([[1.0, dt], [0.0, 1.0]]).double(), torch.eye(dim))
+    torch.testing.assert_close(f, transition.expand_as(f))
+    torch.testing.assert_close(found, torch.tensor(expected).expand_as(found))
+    scenario = make_scenario("wsn-v0", n_uavs=3)
+    arena = Arena(dim, 3, dt, (0.0,) * dim, (10.0,) * dim)
+    errors = error_model(replace(scenario, arena=arena, process=model))
+    truth = Kinematics(x[..., :dim], x[..., dim:], x[..., :0])
+    for ours, theirs in zip(errors.transition(truth, truth), (f, found), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_held_acceleration_moves_as_it_says() -> None:
+    """One draw for each axis: p and v go together."""
+    process = ConstantVelocityProcess(2, DT, ConstantVelocity(0.7, held=True))
+    assert process.noise_size == 2
+    x, w = states(process), normal(1, 50, 2, seed=3)
+    moved = process.propagate(x, x[..., :0], seconds(x), w)
+    p, v = x.split(2, -1)
+    acceleration = 0.7 * w
+    torch.testing.assert_close(moved[..., 2:], v + DT * acceleration)
+    torch.testing.assert_close(moved[..., :2], p + DT * v + 0.5 * DT**2 * acceleration)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"accel_std": -0.1}, "accel_std=-0.1 is not allowed: a standard deviation ≥ 0"),
+        ({"damping": 0.0}, "damping=0.0 is not allowed: a time in s > 0"),
+        ({"held": True, "damping": 2.0}, "held=True is not allowed: without damping"),
+    ],
+)
+def test_velocities_that_make_no_sense_are_refused(wrong: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=f"ConstantVelocity: {words}"):
+        ConstantVelocity(**wrong)
 
 
 # ---------------------------------------------------------------- against the world

@@ -2,11 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from agents import make, pf
+from agents.particles import renewal
+from coloc_env.scenarios import make_scenario
 from training.bench import NAMES, bench
+from training.bench_parts import REST, Stopwatch, _watching, step_parts
 
 
 def test_a_quick_benchmark_writes_numbers_and_figures(
@@ -33,3 +38,31 @@ def test_an_unwritable_folder_is_refused_before_anything_is_measured(tmp_path: P
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="is not a folder"):
         bench(tmp_path / "file", quick=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("ekf", set()),
+        ("apf", {"noise", "likelihood", "weights", "moments", "resampling"}),
+        ("pfnn", {"noise", "likelihood", "weights", "resampling", "corrector network"}),
+        ("apf:proposal=ekf", {"noise", "likelihood", "weights", "proposal", "Gaussian update"}),
+        ("pfnn_trust", {"likelihood", "Gaussian update", "trust features", "trust networks"}),
+    ],
+)
+def test_the_time_of_a_step_is_put_down_to_its_parts(name: str, parts: set[str]) -> None:
+    scenario = make_scenario("indoor-v0", n_uavs=2)
+    found = step_parts(make(name, scenario), scenario)
+    assert parts | {"messages", "prediction", "linearization", REST} <= set(found)
+    assert list(found)[-1] == REST
+    assert min(found.values()) > 0
+
+
+def test_watching_leaves_everything_as_it_was() -> None:
+    scenario = make_scenario("indoor-v0", n_uavs=2)
+    localizer: Any = make("pfnn", scenario)
+    before = pf.normal, renewal.moments, localizer.renewal.weigh
+    with _watching(localizer, Stopwatch()):
+        during = pf.normal, renewal.moments, localizer.renewal.weigh
+    assert all(one is not other for one, other in zip(before, during, strict=True))
+    assert (pf.normal, renewal.moments, localizer.renewal.weigh) == before

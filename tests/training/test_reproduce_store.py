@@ -101,9 +101,16 @@ def test_code_of_what_is_imported_counts(tmp_path: Path) -> None:
 
 
 def test_agents_share_no_more_than_they_use() -> None:
-    assert identity.code_of("ekf") == identity.code_of("ekf:robust=huber")
-    assert identity.code_of("ekf") != identity.code_of("pf500")
-    assert identity.code_of("ekf") != identity.code_of("ekf", "training.pfnn_online")
+    room = make_scenario("indoor-v0", anchors=4)
+
+    def code(agent: str, *modules: str) -> str:
+        return identity.code_of(make(agent, room), *modules)
+
+    assert code("ekf") == code("ekf:robust=huber")
+    assert code("ekf") != code("pf500")
+    assert code("ekf") != code("ekf", "training.pfnn_online")
+    assert code("hpff") != code("hpff:main=ekf")  # what it is made of counts
+    assert code("hpff") == code("hpff:main=pf500")
 
 
 def learned(scale: float, nested: bool) -> Localizer:

@@ -22,7 +22,7 @@ from coloc_env.scenarios import make_scenario
 from training import runs
 from training import trust as training
 from training.flights import fly
-from training.trust import Fleet, TrustLoss, negative_log_likelihood
+from training.trust import TrustLoss, negative_log_likelihood
 
 SMALL = {
     "scenario": "indoor-v0:n_uavs=3:horizon=10",
@@ -167,32 +167,6 @@ def test_failed_uavs_do_not_count(recorded: SimpleNamespace) -> None:
 
 
 # ---------------------------------------------------------------- flights
-
-
-class Landed:
-    """As much of a collector as a fleet asks for."""
-
-    def __init__(self, batches: list[TensorDict]) -> None:
-        self.batches, self.frames_per_batch = batches, 5
-        self.total_frames = 5 * len(batches)
-        self.shut = False
-
-    def __iter__(self) -> Any:
-        return iter(self.batches)
-
-    def shutdown(self) -> None:
-        self.shut = True
-
-
-def test_a_fleet_yields_every_batch_in_turn() -> None:
-    batches = [[TensorDict({"at": torch.tensor([i, k])}) for k in range(3 + i)] for i in range(3)]
-    collectors: list[Any] = [Landed(own) for own in batches]
-    fleet = Fleet(collectors)
-    found = [batch["at"].tolist() for batch in fleet]
-    assert found == [[i, k] for k in range(5) for i in range(3) if k < 3 + i]
-    assert fleet.total_frames == 5 * (3 + 4 + 5)
-    fleet.shutdown()
-    assert all(one.shut for one in collectors)
 
 
 def test_an_epoch_flies_every_variant_in_worlds_of_its_own(

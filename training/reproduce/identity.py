@@ -16,24 +16,27 @@ from typing import Any
 import torch
 from torch import nn
 
-from agents.localizer import LOCALIZERS, Localizer
+from agents.localizer import Localizer
 
 _PACKAGES = ("agents", "coloc_env", "training")
 _WORLD = ("coloc_env.world", "coloc_env.scenarios", "coloc_env.bounds", "training.play")
 
 
-def code_of(agent: str, *modules: str) -> str:
-    """Hash of the code that an agent and its worlds run, and of other modules."""
-    factory = LOCALIZERS[agent.split(":")[0]]
-    source = inspect.getsourcefile(factory)
+def code_of(localizer: Localizer, *modules: str) -> str:
+    """Hash of the code that a localizer, the localizers it is made of, and its worlds run, and of
+    other modules."""
+    made_of = {type(part) for part in _parts(localizer, set()) if isinstance(part, Localizer)}
+    sources = sorted(filter(None, map(inspect.getsourcefile, made_of)))
     first = [file for name in (*_WORLD, *modules) for file in _files(name)]
-    return _closure((*first, *([Path(source)] if source else [])))
+    return _closure((*first, *map(Path, sources)))
 
 
 def weights_of(localizer: Localizer) -> str | None:
     """Hash of a localizer's learned weights, wherever in its parts; None if it has none."""
     digest, some = hashlib.sha256(), False
-    for module in _modules(localizer, set()):
+    for module in _parts(localizer, set()):
+        if not isinstance(module, nn.Module):
+            continue
         for key, value in module.state_dict().items():
             some = True
             digest.update(f"{key}{tuple(value.shape)}".encode())
@@ -41,23 +44,21 @@ def weights_of(localizer: Localizer) -> str | None:
     return digest.hexdigest()[:12] if some else None
 
 
-def _modules(part: Any, seen: set[int]) -> Iterator[nn.Module]:
-    """The neural parts of an object of this project, of its parts, and so on."""
+def _parts(part: Any, seen: set[int]) -> Iterator[Any]:
+    """An object of this project, its parts, and so on; what lies inside a neural part aside."""
     if id(part) in seen:
         return
     seen.add(id(part))
-    if isinstance(part, nn.Module):
-        yield part
-        return
+    yield part
     inside: Iterable[Any] = ()
     if isinstance(part, list | tuple):
         inside = part
     elif isinstance(part, dict):
         inside = part.values()
     elif hasattr(part, "__dict__") and type(part).__module__.split(".")[0] == "agents":
-        inside = vars(part).values()
+        inside = () if isinstance(part, nn.Module) else vars(part).values()
     for each in inside:
-        yield from _modules(each, seen)
+        yield from _parts(each, seen)
 
 
 @lru_cache

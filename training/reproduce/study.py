@@ -75,6 +75,7 @@ def _built(variant: Variant) -> Scenario:
 @cache
 def _settings(piece: Piece) -> dict[str, Any]:
     scenario = piece.variant.build()
+    localizer = make(piece.agent, scenario)
     return {
         "scenario": scenario.name,
         "overrides": dict(piece.variant.overrides),
@@ -82,8 +83,8 @@ def _settings(piece: Piece) -> dict[str, Any]:
         "seed": piece.seed,
         "runs": piece.runs,
         "agent": piece.agent,
-        "weights": weights_of(make(piece.agent, scenario)),
-        "code": code_of(piece.agent),
+        "weights": weights_of(localizer),
+        "code": code_of(localizer),
         "torch": str(torch.__version__),
     }
 

@@ -81,6 +81,13 @@ class AnchorRanges(_Ranges):
 
     mask_leaf = "anchor_range_mask"
 
+    def ends(
+        self, observation: Observation, neighbours: Neighbours
+    ) -> tuple[Float[Tensor, "B N T*P"], Float[Tensor, "B N P d"]]:
+        """What was measured (m), and the points that distances are to."""
+        d = neighbours.position.shape[-1]
+        return observation["anchor_ranges"], observation["anchor_map"].unflatten(-1, (-1, d))
+
     def __init__(self, sensor: AnchorRanging) -> None:
         super().__init__(sensor.noise.std, sensor.tags)
         self.n_tags = sensor.n_tags
@@ -108,6 +115,12 @@ class UavRanges(_Ranges):
 
     cooperative = True
     mask_leaf = "range_mask"
+
+    def ends(
+        self, observation: Observation, neighbours: Neighbours
+    ) -> tuple[Float[Tensor, "B N S*T*T"], Float[Tensor, "B N S d"]]:
+        """What was measured (m), and the points that distances are to."""
+        return observation["ranges"], neighbours.position
 
     def __init__(self, sensor: Ranging) -> None:
         super().__init__(sensor.noise.std, sensor.tags)

@@ -14,11 +14,16 @@ from coloc_env.datasets.files import DataError, FileFormat, distinct, fail, read
 SECONDS = FileFormat(("x", "n"), "seconds", whole=("n",))
 NANOSECONDS = FileFormat(("x", "n"), "nanoseconds", ",", whole=("n",))
 NAMED = FileFormat(("x", "n"), "relative seconds", ",", header=True, whole=("n",))
+STAMPED = FileFormat(("x", "n"), "nanoseconds", ",", header=True, whole=("n",), stamp_column="at")
+MARKED = FileFormat(("x", "n"), "relative seconds", whole=("n",), words=("b", "a"))
 GOOD = {
     SECONDS: "# t x n\n1248444175.103 \t 2.5 \t 7\n\n1248444175.115  -1e-3  8\n1248444175.2 1 9\n",
     NANOSECONDS: "#t,x,n\n1403715273262142976,2.5,7\n1403715273262142977,-1e-3,8\n"
     "1403715273262142977,1,9\n",
     NAMED: 'n,text,timestamp,x\n7,"a, b",1e-09,2.5\n8,"[1 2\n 3]",1e-06,-1e-3\n9,c,1.5,1\n',
+    STAMPED: "%time,n,at,x\n0,7,1.4e+18,2.5\n1,8,1.4037152732621426e+18,-1e-3\n"
+    "2,9,1403715273262142977,1\n",
+    MARKED: "# a or b\na 3 1\nb 0.5 2.5 7 \n\nb 1 -1e-3 8\na 2 1\nb 1.5 1 9\n",
 }
 
 
@@ -40,6 +45,8 @@ def write(folder: Path, text: str) -> Path:
         (SECONDS, [1248444175103000000, 1248444175115000000, 1248444175200000000]),
         (NANOSECONDS, [1403715273262142976, 1403715273262142977, 1403715273262142977]),
         (NAMED, [1, 1000, 1500000000]),
+        (STAMPED, [1400000000000000000, 1403715273262142600, 1403715273262142977]),
+        (MARKED, [500000000, 1000000000, 1500000000]),
     ],
 )
 def test_good_file(tmp_path: Path, form: FileFormat, time: list[int]) -> None:
@@ -62,6 +69,10 @@ def test_times_are_exact(tmp_path_factory: pytest.TempPathFactory, stamps: list[
     assert read(write(folder, "\n".join(seconds)), SECONDS).time.tolist() == stamps
     whole = [f"{t},1,1" for t in stamps]
     assert read(write(folder, "\n".join(whole)), NANOSECONDS).time.tolist() == stamps
+    late = [t for t in stamps if t >= 10**18]
+    powers = [f"{t // 10**18}.{t % 10**18:018d}e+18,1,1" for t in late]
+    if powers:
+        assert read(write(folder, "\n".join(powers)), NANOSECONDS).time.tolist() == late
 
 
 @pytest.mark.parametrize(
@@ -91,6 +102,16 @@ def test_times_are_exact(tmp_path_factory: pytest.TempPathFactory, stamps: list[
         (NAMED, "c,1.5", "c,-1", "line 5: the time is before that of the line above"),
         (NAMED, "9,c", "nine,c", "line 5: n is 'nine', not a number"),
         (NAMED, "9,c", '9,"c', "line 5: 2 columns, not 4"),
+        (STAMPED, "at,", "when,", "line 1: the header does not name one column 'at'"),
+        (STAMPED, "426e+18", "426e+17", "line 3: the time is 1.4037152732621426e+17, not nanosec"),
+        (STAMPED, "426e+18", "426e+185", "line 3: the time is 1.4037152732621426e+185, not"),
+        (STAMPED, "1.4037", "14.037", "line 3: the time is 14.037152732621426e+18, not nanosec"),
+        (STAMPED, "1.4037152732621426e", "1.4037152732621426123e", "line 3: the time is 1.403715"),
+        (SECONDS, "1248444175.115", "1.248444175e+18", "line 4: the time is 1.248444175e+18, not"),
+        (MARKED, "a 2 1", "c 2 1", "line 6: begins with 'c', not b or a"),
+        (MARKED, "b 1 -1e-3 8", "b 1 -1e-3", "line 5: 3 columns, not 4"),
+        (MARKED, "b 1.5 1 9", "b 1.5 one 9", "line 7: x is 'one', not a number"),
+        (MARKED, "b 1.5 1 9", "b 1.5 1 9.5", "line 7: n is 9.5, not a whole number"),
     ],
 )
 def test_damage_is_located(

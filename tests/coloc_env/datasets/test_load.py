@@ -10,6 +10,19 @@ from coloc_env.datasets import DataError, Recording, Table, Track, load, sequenc
 
 POSE = "0,0,0,1,0,0,0,0,0,0,0,0,0,0,0,0"
 FLIGHT = {"imu0.csv": "#\n1000,0,0,0,0,0,9.8\n", "groundtruth.csv": f"#\n1000,{POSE}\n"}
+WALK = {
+    "trajectory.csv": "timestamp,x,y,heading_degrees\n1000,0,0,0\n",
+    "A3.csv": "%time,field.stamp,field.id,field.x,field.y,field.z,field.distanceFromTag\n"
+    "1000,1000,3,1,2,1.1,3\n",
+}
+LABYRINTH = {
+    f"{name}_{kind}.txt": content
+    for name in ("b", "a")
+    for kind, content in {
+        "Input": "range2 0.5 1 0.01 0 0 105 0\nodom2diff 0.5 0 0 0 0.1 0 0 0\n",
+        "GT": "point2 0.5 0 0 0 0 0 0\n",
+    }.items()
+}
 DRIVE = {"Barcodes.dat": "1 5\n2 6\n9 7\n", "Landmark_Groundtruth.dat": "9 0 0 0 0\n"}
 
 
@@ -30,6 +43,9 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     contents = {f"euroc/{name}": FLIGHT for name in ("MH_01", "MH_02", "V1_01", "V1_02", "V2_01")}
     contents |= {"mrclam/a": drive(1), "mrclam/b": drive(2), "mrclam/c": drive(2)}
     contents |= {"mrclam/other": {"readme.txt": "nothing"}, "miluv": {"readme.txt": "nothing"}}
+    cases = ("NLOS/Trajectory_A/Case_1", "LOS/Trajectory_B/Case_3", "LOS/Trajectory_B/Case_4")
+    contents |= {f"hanyang_outdoor_uwb/{case}": WALK for case in cases}
+    contents["tuc_indoor_uwb"] = LABYRINTH | {"c_GT.txt": "", "readme.txt": "nothing"}
     for folder, files in contents.items():
         (root / folder).mkdir(parents=True)
         for name, content in files.items():
@@ -41,6 +57,9 @@ def test_sequences(data: Path) -> None:
     assert sequences("mrclam") == ("a", "b", "c")
     assert sequences("euroc", data) == ("MH_01", "MH_02", "V1_01", "V1_02", "V2_01")
     assert sequences("miluv") == ()
+    assert sequences("tuc") == ("a", "b")
+    cases = ("LOS/Trajectory_B/Case_3", "LOS/Trajectory_B/Case_4", "NLOS/Trajectory_A/Case_1")
+    assert sequences("hanyang") == cases
 
 
 @pytest.mark.parametrize(
@@ -51,6 +70,10 @@ def test_sequences(data: Path) -> None:
         ("euroc", None, "euroc/MH_01+MH_02"),
         ("euroc", "V1_02", "euroc/V1_02"),
         ("euroc", "V1_02,V1_01", "euroc/V1_02+V1_01"),
+        ("tuc", None, "tuc/a"),
+        ("tuc", "b", "tuc/b"),
+        ("hanyang", None, "hanyang/LOS/Trajectory_B/Case_3"),
+        ("hanyang", "NLOS/Trajectory_A/Case_1", "hanyang/NLOS/Trajectory_A/Case_1"),
     ],
 )
 def test_which_is_loaded(data: Path, name: str, sequence: str | None, loaded: str) -> None:
@@ -61,12 +84,14 @@ def test_which_is_loaded(data: Path, name: str, sequence: str | None, loaded: st
 @pytest.mark.parametrize(
     ("name", "sequence", "reason"),
     [
-        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv"),
+        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv, tuc, hanyang"),
         ("mrclam", "d", "no sequence 'd' in .*mrclam, there are: a, b, c"),
         ("mrclam", "a,b", "one sequence at a time, not a,b"),
         ("euroc", "V1_01,V9", "no sequence 'V9'"),
         ("euroc", "V1_01,V2_01", "different sequences of one room"),
         ("miluv", None, "no sequence of miluv in"),
+        ("tuc", "c", "no sequence 'c' in .*tuc_indoor_uwb, there are: a, b"),
+        ("hanyang", "LOS/Trajectory_B", "no sequence 'LOS/Trajectory_B' in .*, there are: LOS/Tra"),
         ("miluv", "x", "no sequence 'x' in .*miluv, there are: none"),
     ],
 )
@@ -77,7 +102,7 @@ def test_what_is_not_there(data: Path, name: str, sequence: str | None, reason: 
 
 def test_no_data(data: Path) -> None:
     for name in datasets.DATASETS:
-        with pytest.raises(DataError, match=f"away: set COLOC_DATA or --data .*{name}/ \\(from"):
+        with pytest.raises(DataError, match=f"away: set COLOC_DATA or --data .*{name}.*/ \\(from"):
             load(name, data=data / "away")
     (data / "miluv" / "readme.txt").unlink()
     (data / "miluv").rmdir()

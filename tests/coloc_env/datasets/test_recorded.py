@@ -3,9 +3,11 @@
 The bounds are loose around what was measured; the loaders' docstrings state the figures.
 """
 
+import csv
 import os
 import time
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from coloc_env.datasets import DataError, Recording, Table, Track, load
+from coloc_env.datasets import DataError, Recording, Table, Track, data_root, load
 from coloc_env.datasets.recording import Flags, Floats, Stamps
 
 SECOND = 1_000_000_000
@@ -313,3 +315,124 @@ def test_miluv_magnetometer(miluv: Recording) -> None:
     fit, *_ = np.linalg.lstsq(design, readings, rcond=None)
     assert np.std(readings - design @ fit) < 8
     assert fit[2] < -20
+
+
+def horizontal_errors(recording: Recording, delay: float) -> tuple[Floats, Floats]:
+    """Range minus true distance of one tag in the plane, and the anchors' indices; ``delay`` s."""
+    (table,), (track,) = recording.streams["anchor_ranges"], recording.truth
+    when = table.time - round(delay * SECOND)
+    inside = (when >= track.time[0]) & (when <= track.time[-1])
+    offset = (
+        at(track.time, track.position, when) - recording.anchors[table.values[:, 1].astype(int)]
+    )
+    return (table.values[:, 2] - np.hypot(*offset.T))[inside], table.values[inside, 1]
+
+
+@pytest.fixture(scope="module")
+def tuc() -> Recording:
+    return recorded("tuc", "Indoor_UWB")
+
+
+def test_tuc_against_its_files(tuc: Recording) -> None:
+    """Read anew: 233 lines of each kind, at the same stamps."""
+    folder = data_root() / "tuc_indoor_uwb"
+    lines = [line.split() for line in (folder / "Indoor_UWB_Input.txt").read_text().splitlines()]
+    truth = [line.split() for line in (folder / "Indoor_UWB_GT.txt").read_text().splitlines()]
+    ranges = [line for line in lines if line[0] == "range2"]
+    stamps = [round(Decimal(line[1]) * SECOND) for line in ranges]
+    (table,), (wheels,) = tuc.streams["anchor_ranges"], tuc.streams["odometry"]
+    for each in (table.time, wheels.time, tuc.truth[0].time):
+        assert each.tolist() == stamps
+    assert len(stamps) == 233
+    assert tuc.truth[0].position.tolist() == [[float(x), float(y)] for _, _, x, y, *_ in truth]
+    assert table.values[:, 2].tolist() == [float(line[2]) for line in ranges]
+    numbers = np.array([105, 107, 108, 109])
+    assert numbers[table.values[:, 1].astype(int)].tolist() == [int(line[6]) for line in ranges]
+    for line, place in zip(ranges, tuc.anchors[table.values[:, 1].astype(int)], strict=True):
+        assert [float(line[4]), float(line[5])] == place.tolist()
+
+
+def test_tuc_ranges(tuc: Recording) -> None:
+    """The figures of NOTES.md, and ranges and truth in time."""
+    errors, anchors = horizontal_errors(tuc, 0.0)
+    assert np.median(errors) == pytest.approx(0.10, abs=0.01)
+    assert np.std(errors) == pytest.approx(0.11, abs=0.01)
+    assert np.abs(errors).max() == pytest.approx(0.66, abs=0.01)
+    biases = [np.median(errors[anchors == anchor]) for anchor in range(4)]
+    np.testing.assert_allclose(biases, [0.15, 0.07, 0.11, 0.08], atol=0.01)
+    spreads = {lag: spread(horizontal_errors(tuc, lag)[0])[1] for lag in (-0.3, 0.0, 0.3)}
+    assert spreads[0.0] < 0.8 * min(spreads[-0.3], spreads[0.3])
+
+
+def test_tuc_odometry(tuc: Recording) -> None:
+    """Dead reckoning of the whole recording, turned and moved onto the truth (complex plane)."""
+    (table,), (track,) = tuc.streams["odometry"], tuc.truth
+    step = np.diff(table.time) / SECOND
+    heading = np.append(0.0, np.cumsum(table.values[:-1, 1] * step))
+    way = table.values[:-1, 0] * step * np.exp(0.5j * (heading[1:] + heading[:-1]))
+    told = np.append(0.0, np.cumsum(way))
+    true = track.position[:, 0] + 1j * track.position[:, 1]
+    told, true = told - told.mean(), true - true.mean()
+    turn = np.vdot(told, true)
+    assert np.sqrt(np.mean(np.abs(true - told * turn / abs(turn)) ** 2)) < 0.08
+    assert abs(np.rad2deg(np.angle(-turn))) < 20
+    assert np.sum(np.abs(way)) == pytest.approx(9.2, abs=0.2)
+
+
+HANYANG = {
+    "LOS/Trajectory_A/Case_1": (235, 0.184, 0.06),
+    "LOS/Trajectory_B/Case_3": (185, 0.178, 0.03),
+    "NLOS/Trajectory_A/Case_1": (314, 0.165, 0.13),
+    "NLOS/Trajectory_B/Case_4": (178, 0.183, 0.08),
+}
+
+
+@pytest.mark.parametrize("sequence", HANYANG)
+def test_hanyang_against_its_files(sequence: str) -> None:
+    """Read anew: exact stamps, ranges made horizontal, and the figures of NOTES.md."""
+    recording = recorded("hanyang", sequence)
+    folder = data_root() / "hanyang_outdoor_uwb" / sequence
+    (table,), (track,) = recording.streams["anchor_ranges"], recording.truth
+    with (folder / "trajectory.csv").open() as file:
+        walked = list(csv.DictReader(file))
+    stamps = [int(Decimal(row["timestamp"])) for row in walked]
+    assert (track.time + stamps[0]).tolist() == stamps
+    assert round(track.time[-1] / SECOND) == HANYANG[sequence][0]
+    with (folder / "gnss.csv").open() as file:
+        fixes = np.array([int(row["field.header.stamp"]) for row in csv.DictReader(file)])
+    assert max(np.abs(fixes - stamp).min() for stamp in stamps) < 250
+    places = np.array([[float(row[axis]) for axis in "xyz"] for row in walked])
+    for index, number in enumerate((3, 5, 9, 12)):
+        with (folder / f"A{number}.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        x, y, z = (float(rows[0][f"field.{axis}"]) for axis in "xyz")
+        distance = np.array([float(row["field.distanceFromTag"]) for row in rows])
+        when = np.array([int(row["field.stamp"]) for row in rows]) - stamps[0]
+        assert recording.anchors[index].tolist() == [x, y]
+        own, kept = table.values[:, 1] == index, distance >= abs(z - 1.1)
+        assert np.sum(~kept) <= 3
+        assert table.time[own].tolist() == when[kept].tolist()
+        whole = np.hypot(table.values[own, 2], z - 1.1)
+        np.testing.assert_allclose(whole, distance[kept], rtol=1e-12)
+        inside = (when >= 0) & (when <= track.time[-1])
+        true = np.linalg.norm(at(track.time, places, when[inside]) - (x, y, z), axis=1)
+        bias, deviation = spread(distance[inside] - true)
+        assert -0.23 < bias < 0.17
+        assert 0.13 < deviation < 0.34
+
+
+@pytest.mark.parametrize("sequence", HANYANG)
+def test_hanyang_ranges(sequence: str) -> None:
+    """Ranges are late; what is far off is too short."""
+    recording = recorded("hanyang", sequence)
+    _, delay, bias = HANYANG[sequence]
+    errors, anchors = horizontal_errors(recording, delay)
+    middle, deviation = spread(errors)
+    assert middle == pytest.approx(bias, abs=0.02)
+    assert deviation < 0.13
+    assert deviation < 0.75 * spread(horizontal_errors(recording, 0.0)[0])[1]
+    assert deviation < 0.9 * spread(horizontal_errors(recording, 2 * delay)[0])[1]
+    assert np.ptp([np.median(errors[anchors == anchor]) for anchor in range(4)]) < 0.07
+    assert 0.002 < np.mean(np.abs(errors) > 1) < 0.008
+    assert errors.max() < 0.9
+    assert errors.min() < -10

@@ -7,7 +7,7 @@ import numpy as np
 from training import metrics
 from training.metrics import Difference, Floats
 from training.reproduce.pfnn import paper
-from training.reproduce.pfnn.flown import Case, Flown, per_run
+from training.reproduce.pfnn.flown import Case, Flown
 from training.reproduce.verdicts import Claim, gain, interval
 
 _NEAR_MAX = 0.95  # of the most particles: "near the maximum"
@@ -82,7 +82,7 @@ def _share(f: Flown, key: str, low: float, high: float) -> Difference:
     """Per cent of the steps after 10 s with a figure from ``low`` to ``high``."""
     values, late = f.tables.agents["pfnn"].series[key][:, f.steady], f.steady
     inside = 100.0 * ((values >= low) & (values <= high))
-    return interval(per_run(inside, f.tables.scored[:, late] & ~np.isnan(values)))
+    return interval(metrics.mean_per_run(inside, f.tables.scored[:, late] & ~np.isnan(values)))
 
 
 def _share_resampling(f: Flown) -> Difference:

@@ -36,12 +36,12 @@ class Flown:
 
     def mean(self, agent: str) -> Floats:
         """[R]: mean error, m."""
-        return per_run(self.error(agent), self.tables.scored)
+        return metrics.mean_per_run(self.error(agent), self.tables.scored)
 
     def particles(self, agent: str) -> Floats | None:
         """[R], None for what has no particles."""
         values = self.tables.agents[agent].series.get("particles")
-        return None if values is None else per_run(values, self.tables.scored)
+        return None if values is None else metrics.mean_per_run(values, self.tables.scored)
 
     def error(self, agent: str) -> Floats:
         """[R, K, N], m."""
@@ -60,9 +60,3 @@ class Case(NamedTuple):
     claim: Claim
     needs: tuple[str, ...]
     figure: Callable[[Flown], Difference | None]
-
-
-def per_run(values: Floats, counts: metrics.Flags) -> Floats:
-    """[R]: mean over steps and UAVs of what counts and is not NaN."""
-    kept = np.where(counts, values, np.nan)
-    return np.array([metrics.mean(run) for run in kept])

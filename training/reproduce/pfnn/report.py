@@ -1,22 +1,19 @@
 """The report: every table and figure with the paper's numbers beside ours, and the verdicts."""
 
-import json
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from training.reproduce import cost, verdicts
+from training.reproduce import cost, reporting, verdicts
 from training.reproduce.pfnn import figures, goals, paper, robust_figures, robustness, tables
 from training.reproduce.pfnn.claims import verdicts as judge
 from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.robustness import Cells
-from training.reproduce.study import Study, Variant
-from training.reproduce.verdicts import Verdict
-from training.results import plain, table
+from training.reproduce.reporting import Text
+from training.reproduce.study import Variant
+from training.results import table
 
-Text = list[str]
 FILES = (
     *figures.FILES,
     *robust_figures.FILES,
@@ -38,7 +35,15 @@ def paper_part(flown: Flown, folder: Path) -> Text:
         "Figure 2 in numbers (m)": tables.figure_2(flown),
     }
     what = flown.tables
-    text = ["## The paper's claims", "", verdicts.RULE, "", _counts(judged), "", *_claims(judged)]
+    text = [
+        "## The paper's claims",
+        "",
+        verdicts.RULE,
+        "",
+        reporting.counts(judged),
+        "",
+        *reporting.claims(judged),
+    ]
     last, more = what.seed + what.runs - 1, what.seed + flown.cdf.runs - 1
     text += [
         "",
@@ -70,9 +75,9 @@ def paper_part(flown: Flown, folder: Path) -> Text:
             }
             for name, one in flown.cost.items()
         },
-        "claims": [_as_json(each) for each in judged],
+        "claims": [reporting.as_json(each) for each in judged],
     }
-    _write_json(folder / "paper.json", content)
+    reporting.write_json(folder / "paper.json", content)
     return text
 
 
@@ -98,7 +103,7 @@ def robust_part(
             for o in judged
         ],
     }  # fmt: skip
-    _write_json(folder / "robustness.json", content)
+    reporting.write_json(folder / "robustness.json", content)
     text = ["## Robustness", ""]
     for name, caption in captions.items():
         text += [f"![{caption}]({name})", "", f"*{caption}*", ""]
@@ -123,54 +128,9 @@ def robust_part(
     return text + table(["agent", "variant", "goal", "found", "verdict"], body, left=5)
 
 
-def failures(study: Study) -> Text:
-    """What could not be flown, and why."""
-    if not study.failed:
-        return []
-    agents: dict[tuple[str, str], list[str]] = {}
-    for (key, agent), why in study.failed.items():
-        agents.setdefault((key, why), []).append(f"`{agent}`")
-    lines = [f"- *{key}*, {', '.join(some)}: {why}" for (key, why), some in agents.items()]
-    return ["", "## Not flown", "", *lines]
-
-
-def _counts(judged: Sequence[Verdict]) -> str:
-    count = Counter(each.verdict for each in judged)
-    kinds = (verdicts.REPRODUCED, verdicts.NOT, verdicts.CONTRADICTED, verdicts.UNKNOWN)
-    return f"**{len(judged)} claims: " + ", ".join(f"{count[x]} {x}" for x in kinds) + ".**"
-
-
-def _claims(judged: Sequence[Verdict]) -> Text:
-    lines = []
-    for each in judged:
-        claim, ours = each.claim, tables.DASH
-        if each.ours is not None:
-            ours = tables.difference(each.ours, 1.0, claim.unit, claim.compares)
-        lines.append([claim.words, claim.theirs, ours, f"**{each.verdict}**: {each.reason}"])
-    return table(["claim", "paper", "ours (95 %)", "verdict"], lines, left=4)
-
-
 def _timed(flown: Flown) -> str:
     machine = platform.processor() or platform.machine()
     return (
         f"Times: one world, one thread ({machine}, torch), all methods step by step in turn; mean "
         "± standard deviation over steps. The paper's are MATLAB's on an Apple M1."
     )
-
-
-def _as_json(each: Verdict) -> dict[str, Any]:
-    ours = each.ours
-    return {
-        "claim": each.claim.words,
-        "paper": each.claim.theirs,
-        "unit": each.claim.unit,
-        "ours": None if ours is None else ours.mean,
-        "interval": None if ours is None else [ours.low, ours.high],
-        "verdict": each.verdict,
-        "reason": each.reason,
-    }
-
-
-def _write_json(path: Path, content: Any) -> None:
-    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")

@@ -22,6 +22,7 @@ from training.reproduce.pfnn.plan import (
 )
 from training.reproduce.pfnn.robustness import cells
 from training.reproduce.pool import Note, fly
+from training.reproduce.reporting import failures
 from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study, Variant
 from training.staging import staged_folder
@@ -93,7 +94,7 @@ def reproduce(
         if beyond:
             found, bounds = cells(study, worlds, robust, runs)
             text += report.robust_part(found, bounds, worlds, robust, folder)
-        text += report.failures(study)
+        text += failures(study)
         (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
 
 

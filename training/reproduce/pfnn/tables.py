@@ -7,12 +7,12 @@ import numpy as np
 from training import metrics
 from training.metrics import Floats
 from training.reproduce.pfnn import paper
-from training.reproduce.pfnn.flown import Flown, per_run
+from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.in_flight import NAME as LEARNING
 from training.reproduce.pfnn.plan import ablation_agents
+from training.reproduce.reporting import DASH, difference
 from training.results import short
 
-DASH = "–"
 Table = tuple[list[str], list[list[str]]]  # header and lines
 
 
@@ -39,7 +39,7 @@ def table_3(flown: Flown) -> Table:
             error, counts = errors[:, :, part], scored[:, :, part]
             tracks = metrics.rmse_per_track(error, counts)
             largest = np.where(counts, error, 0.0).max(1)
-            means = per_run(error, counts)
+            means = metrics.mean_per_run(error, counts)
             ours = (spread(tracks.mean(1)), spread(means), spread(largest.mean(1)))
         theirs = (f"{x:.3f}" for x in row)
         lines.append([name, *(cell for pair in zip(theirs, ours, strict=True) for cell in pair)])
@@ -78,9 +78,9 @@ def table_4(flown: Flown) -> Table:
             spread,
             (
                 metrics.rmse_per_run(error, scored),
-                per_run(error, scored),
+                metrics.mean_per_run(error, scored),
                 largest,
-                per_run(flown.learning.count, scored),
+                metrics.mean_per_run(flown.learning.count, scored),
             ),
         )
         lines.append(line)
@@ -124,15 +124,6 @@ def figure_2(flown: Flown) -> Table:
             cells = [spread(flown.rmse(agent)), apart, spread(flown.largest(agent)), particles]
         lines.append([f"[{span[0]}, {span[1]}]", f"`{agent}`", *cells])
     return header, lines
-
-
-def difference(found: metrics.Difference, scale: float, unit: str, sign: bool = True) -> str:
-    """Mean and 95 % interval in words."""
-    mean, low, high = (
-        f"{scale * x:{'+' if sign else ''}.3g}".replace("-", "−").replace("inf", "∞")
-        for x in (found.mean, found.low, found.high)
-    )
-    return f"{mean}{unit and ' '}{unit} ({low} to {high})"
 
 
 def _printed(value: paper.Spread) -> str:

@@ -1,0 +1,113 @@
+"""Has a filter failed? Detectors that look at an estimate and at the distances to anchors."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float32
+from scipy.stats import chi2
+from torch import Tensor
+
+from agents.checkpoint import Learned
+from agents.layers import Linear, sigmoid
+from agents.models.measurements import AnchorRanges, Neighbours
+from agents.models.process import Process
+from coloc_env.observation import Observation
+
+ANCHORS = 4  # residuals that the network looks at
+HIDDEN = (10, 5)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What distances to A anchors (of all tags) say of an estimate: d = rᵀ R⁻¹ r of the residuals
+    r = z − h(x̂), their sizes (m; 0 where nothing was measured), and how many there are."""
+
+    distance: Float32[Tensor, "B N"]
+    residuals: Float32[Tensor, "B N A"]
+    count: Float32[Tensor, "B N"]
+
+
+def evidence(
+    model: AnchorRanges,
+    process: Process,
+    state: Float[Tensor, "B N S"],
+    observation: Observation,
+) -> Evidence:
+    """The evidence about a state (position alone, unless tags have lever arms)."""
+    nobody = state[..., None, : process.dim]
+    neighbours = Neighbours(nobody, nobody, nobody[..., 0] > torch.inf)
+    block = model.linearize(process, state, observation, neighbours, derivatives=False)
+    residual = block.residual[..., 0] * block.mask
+    squared = residual.square() / block.variance[..., 0]
+    return Evidence(squared.sum(-1).float(), residual.abs().float(), block.mask.sum(-1).float())
+
+
+class Detector(ABC):
+    """Tells from evidence whether a filter has failed."""
+
+    @abstractmethod
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        """The probability that it has; a test that knows no probabilities says 0 or 1."""
+
+
+class ChiSquare(Detector):
+    """Failed if d is beyond the quantile of χ² with as many degrees of freedom as ranges."""
+
+    def __init__(self, quantile: float, most: int) -> None:
+        if not 0 < quantile < 1:
+            raise ValueError(f"quantile={quantile} is not allowed: a probability in (0, 1)")
+        limits = chi2.ppf(quantile, range(1, most + 1))
+        self.limits = torch.tensor((torch.inf, *limits))
+
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        limits = self.limits.to(seen.count.device)[seen.count.long()]
+        return (seen.distance > limits).float()
+
+
+class FailureDetector(Learned):
+    """5–10–5–2 network (tanh, softmax) on [d, |r₁| … |r₄|]: logits of (sound, failed).
+
+    d enters as log(1 + d), whose scale does not depend on R as much.
+    """
+
+    kind = "nnhpff"
+    features = ("log1p_d", "r1", "r2", "r3", "r4")
+
+    def __init__(self) -> None:
+        super().__init__()
+        sizes = (1 + ANCHORS, *HIDDEN)
+        self.hidden = torch.nn.ModuleList(map(Linear, sizes, sizes[1:]))
+        self.out = Linear(HIDDEN[-1], 2)
+
+    def forward(self, features: Float32[Tensor, "*s 5"]) -> Float32[Tensor, "*s 2"]:
+        x = features
+        for layer in self.hidden:
+            x = torch.tanh(layer(x))
+        logits: Tensor = self.out(x)
+        return logits
+
+
+def network_features(seen: Evidence) -> Float32[Tensor, "B N 5"]:
+    """The network's input: with more than four ranges the four largest residuals and d of four out
+    of so many; with fewer, zeros."""
+    d, residuals = seen.distance, seen.residuals
+    d = d * (ANCHORS / seen.count.clamp_min(1.0))
+    if residuals.shape[-1] > ANCHORS:
+        residuals = residuals.topk(ANCHORS, -1).values
+    missing = ANCHORS - residuals.shape[-1]
+    residuals = torch.nn.functional.pad(residuals, (0, missing))
+    return torch.cat((d.log1p().unsqueeze(-1), residuals), -1)
+
+
+class NeuralDetector(Detector):
+    """Failure by the network's probability."""
+
+    def __init__(self, network: FailureDetector) -> None:
+        self.network = network
+
+    @torch.no_grad()
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        logits = self.network(network_features(seen).unsqueeze(-2))[..., 0, :]
+        failed = sigmoid(logits[..., 1] - logits[..., 0])
+        return torch.where(seen.count > 0, failed, 0.0)

@@ -1,0 +1,54 @@
+"""Kidnapping: a UAV is put somewhere else from one step to the next, and nothing tells it."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
+
+
+@dataclass(frozen=True)
+class Kidnapped(Motion):
+    """A motion whose UAVs are found, from step ``at`` on, on the arena's other side.
+
+    Position and velocity are those of the motion turned by half a turn about the arena's vertical
+    axis, so they stay in the box; the attitude is kept (gyroscopes measure while a UAV is carried).
+    ``uavs``: indices of those that are carried; None: all, and then ranges between them tell
+    nothing.
+    """
+
+    motion: Motion
+    at: int
+    uavs: tuple[int, ...] | None = None
+
+    def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
+        if self.at < 1:
+            raise ValueError(f"Kidnapped: at={self.at} is not allowed: a step ≥ 1")
+        strangers = [uav for uav in self.uavs or () if not 0 <= uav < arena.n_uavs]
+        if strangers or self.uavs == ():
+            raise ValueError(f"Kidnapped: uavs={self.uavs} is not allowed: indices of UAVs")
+        return self.motion.start(keys, arena)
+
+    def advance(
+        self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena
+    ) -> tuple[Kinematics, Carry]:
+        moved, carry = self.motion.advance(carry, steps, arena)
+        taken = torch.ones(arena.n_uavs, dtype=torch.bool, device=steps.device)
+        if self.uavs is not None:
+            taken = torch.zeros_like(taken)
+            taken[list(self.uavs)] = True
+        steps = steps.unsqueeze(-1)
+        away = ((steps >= self.at) & taken).unsqueeze(-1)
+        twice = moved.position.new_zeros(arena.dim)
+        twice[:2] = 2 * twice.new_tensor(arena.centre[:2])
+        sign = torch.ones_like(twice)
+        sign[:2] = -1.0
+        return Kinematics(
+            torch.where(away, twice + sign * moved.position, moved.position),
+            torch.where(away, sign * moved.velocity, moved.velocity),
+            moved.attitude,
+            moved.valid,
+            (steps == self.at) & taken,
+        ), carry

@@ -1,0 +1,74 @@
+"""What reports have in common: verdicts as text and JSON, and what could not be flown."""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from training.metrics import Difference
+from training.reproduce import verdicts
+from training.reproduce.study import Study
+from training.reproduce.verdicts import Verdict
+from training.results import plain, table
+
+DASH = "–"
+Text = list[str]
+
+
+def difference(found: Difference, scale: float, unit: str, sign: bool = True) -> str:
+    """Mean and 95 % interval in words."""
+    mean, low, high = (
+        f"{scale * x:{'+' if sign else ''}.3g}".replace("-", "−").replace("inf", "∞")
+        for x in (found.mean, found.low, found.high)
+    )
+    return f"{mean}{unit and ' '}{unit} ({low} to {high})"
+
+
+def counts(judged: Sequence[Verdict]) -> str:
+    """How many claims came out how."""
+    count = Counter(each.verdict for each in judged)
+    kinds = (verdicts.REPRODUCED, verdicts.NOT, verdicts.CONTRADICTED, verdicts.UNKNOWN)
+    return f"**{len(judged)} claims: " + ", ".join(f"{count[x]} {x}" for x in kinds) + ".**"
+
+
+def claims(judged: Sequence[Verdict]) -> Text:
+    """A table of claims and what became of them."""
+    lines = []
+    for each in judged:
+        claim, ours = each.claim, DASH
+        if each.ours is not None:
+            ours = difference(each.ours, 1.0, claim.unit, claim.compares)
+        lines.append([claim.words, claim.theirs, ours, f"**{each.verdict}**: {each.reason}"])
+    return table(["claim", "paper", "ours (95 %)", "verdict"], lines, left=4)
+
+
+def failures(study: Study) -> Text:
+    """What could not be flown, and why."""
+    if not study.failed:
+        return []
+    agents: dict[tuple[str, str], list[str]] = {}
+    for (key, agent), why in study.failed.items():
+        agents.setdefault((key, why), []).append(f"`{agent}`")
+    lines = [f"- *{key}*, {', '.join(some)}: {why}" for (key, why), some in agents.items()]
+    return ["", "## Not flown", "", *lines]
+
+
+def as_json(each: Verdict) -> dict[str, Any]:
+    """A verdict as plain values."""
+    ours = each.ours
+    return {
+        "claim": each.claim.words,
+        "paper": each.claim.theirs,
+        "unit": each.claim.unit,
+        "ours": None if ours is None else ours.mean,
+        "interval": None if ours is None else [ours.low, ours.high],
+        "verdict": each.verdict,
+        "reason": each.reason,
+    }
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Indented, NaN and infinity as null."""
+    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")
