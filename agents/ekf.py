@@ -20,6 +20,7 @@ from agents.models.measurements import Block, Neighbours, heard, make_measuremen
 from agents.models.process import Process, make_process
 from agents.models.update import information, iterated_update, linearizer, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
+from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
@@ -64,11 +65,12 @@ def gaussian_estimate(
 ) -> Estimate:
     """What a Gaussian belief says of position and velocity."""
     d = process.dim
-    return Estimate(
+    return build(
+        Estimate,
+        x.shape[:2],
         position=x[..., :d],
         velocity=x[..., d : 2 * d],
         covariance=covariance[..., :d, :d],
-        batch_size=x.shape[:2],
     )
 
 
@@ -98,12 +100,13 @@ class DeadReckoning(Localizer[GaussianBelief]):
         x, covariance = predict(self.process, belief, observation)
         prior = Prediction(x, covariance, observation, belief.memory)
         x, covariance, memory = self.update(prior)
-        after = GaussianBelief(
+        after = build(
+            GaussianBelief,
+            x.shape[:2],
             state=x,
             covariance=covariance,
             step=belief.step + 1,
             memory=memory,
-            batch_size=x.shape[:2],
         )
         return after, gaussian_estimate(self.process, x, covariance)
 

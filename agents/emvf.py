@@ -14,9 +14,10 @@ from torch import Tensor
 
 from agents.ekf import DeadReckoning, GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer, register
-from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.models.measurements import Block, make_measurements, nobody
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
+from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
@@ -94,11 +95,12 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         reckoned = belief.reckoned
         if self.process.attitude_size:
             reckoned = self.reckoning.watch(reckoned, observation)
-        return WindowBelief(
+        return build(
+            WindowBelief,
+            belief.step.shape,
             window=torch.cat((belief.window[..., 1:, :], row), -2),
             step=belief.step + 1,
             reckoned=reckoned,
-            batch_size=belief.step.shape,
         )
 
     def step(self, belief: WindowBelief, observation: Observation) -> tuple[WindowBelief, Estimate]:
@@ -195,11 +197,8 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     ]:
         """Each step's own rows: ∂h/∂δ, residuals and variances; a row of zeros with variance 1
         where nothing was measured."""
-        nobody = path[..., :1, : self.process.dim]
-        neighbours = Neighbours(nobody, nobody, nobody[..., 0] > torch.inf)
-        rows = [
-            self._rows(m.linearize(self.process, path, leaves, neighbours)) for m in self.models
-        ]
+        alone = nobody(path[..., : self.process.dim])
+        rows = [self._rows(m.linearize(self.process, path, leaves, alone)) for m in self.models]
         jacobian, residual, variance = (torch.cat(parts, 3) for parts in zip(*rows, strict=True))
         return jacobian, residual, variance
 

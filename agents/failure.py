@@ -1,16 +1,17 @@
 """Has a filter failed? Detectors that look at an estimate and at the distances to anchors."""
 
 from abc import ABC, abstractmethod
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float32
 from scipy.stats import chi2
 from torch import Tensor
+from torch.nn import functional
 
 from agents.checkpoint import Learned
-from agents.layers import Linear, sigmoid
-from agents.models.measurements import AnchorRanges, Neighbours
+from agents.models.measurements import AnchorRanges, nobody
 from agents.models.process import Process
 from coloc_env.observation import Observation
 
@@ -34,13 +35,19 @@ def evidence(
     state: Float[Tensor, "B N S"],
     observation: Observation,
 ) -> Evidence:
-    """The evidence about a state (position alone, unless tags have lever arms)."""
-    nobody = state[..., None, : process.dim]
-    neighbours = Neighbours(nobody, nobody, nobody[..., 0] > torch.inf)
-    block = model.linearize(process, state, observation, neighbours, derivatives=False)
-    residual = block.residual[..., 0] * block.mask
-    squared = residual.square() / block.variance[..., 0]
-    return Evidence(squared.sum(-1).float(), residual.abs().float(), block.mask.sum(-1).float())
+    """The evidence about a state (its position alone, unless tags have lever arms)."""
+    alone = nobody(state[..., : process.dim])
+    if model.tags:
+        block = model.linearize(process, state, observation, alone, derivatives=False)
+        residual, mask = block.residual[..., 0] * block.mask, block.mask
+        squared = residual.square() / block.variance[..., 0]
+    else:
+        ranges, anchors = model.ends(observation, alone)
+        distance = (state[..., None, : process.dim] - anchors).norm(dim=-1)
+        mask = observation["anchor_range_mask"]
+        residual = (ranges - distance) * mask
+        squared = residual.square() / model.variance
+    return Evidence(squared.sum(-1).float(), residual.abs().float(), mask.sum(-1).float())
 
 
 class Detector(ABC):
@@ -77,15 +84,14 @@ class FailureDetector(Learned):
     def __init__(self) -> None:
         super().__init__()
         sizes = (1 + ANCHORS, *HIDDEN)
-        self.hidden = torch.nn.ModuleList(map(Linear, sizes, sizes[1:]))
-        self.out = Linear(HIDDEN[-1], 2)
+        self.hidden = torch.nn.ModuleList(map(torch.nn.Linear, sizes, sizes[1:]))
+        self.out = torch.nn.Linear(HIDDEN[-1], 2)
 
-    def forward(self, features: Float32[Tensor, "*s 5"]) -> Float32[Tensor, "*s 2"]:
+    def forward(self, features: Float[Tensor, "*s 5"]) -> Float[Tensor, "*s 2"]:
         x = features
         for layer in self.hidden:
-            x = torch.tanh(layer(x))
-        logits: Tensor = self.out(x)
-        return logits
+            x = torch.tanh(functional.linear(x, layer.weight, layer.bias))
+        return functional.linear(x, self.out.weight, self.out.bias)
 
 
 def network_features(seen: Evidence) -> Float32[Tensor, "B N 5"]:
@@ -96,7 +102,7 @@ def network_features(seen: Evidence) -> Float32[Tensor, "B N 5"]:
     if residuals.shape[-1] > ANCHORS:
         residuals = residuals.topk(ANCHORS, -1).values
     missing = ANCHORS - residuals.shape[-1]
-    residuals = torch.nn.functional.pad(residuals, (0, missing))
+    residuals = functional.pad(residuals, (0, missing)) if missing > 0 else residuals
     return torch.cat((d.log1p().unsqueeze(-1), residuals), -1)
 
 
@@ -104,10 +110,10 @@ class NeuralDetector(Detector):
     """Failure by the network's probability."""
 
     def __init__(self, network: FailureDetector) -> None:
-        self.network = network
+        self.network = deepcopy(network).double().requires_grad_(False)
 
-    @torch.no_grad()
     def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
-        logits = self.network(network_features(seen).unsqueeze(-2))[..., 0, :]
-        failed = sigmoid(logits[..., 1] - logits[..., 0])
-        return torch.where(seen.count > 0, failed, 0.0)
+        # In float64, so that the order of sums, which depends on the batch, shows nowhere.
+        logits = self.network(network_features(seen).double())
+        failed = torch.sigmoid(logits[..., 1] - logits[..., 0]).float()
+        return failed * (seen.count > 0)

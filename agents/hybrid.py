@@ -15,6 +15,7 @@ from agents.failure import ChiSquare, Detector, FailureDetector, NeuralDetector,
 from agents.localizer import Estimate, Localizer, make, register
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
+from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
@@ -95,7 +96,7 @@ class HybridFilter(Localizer[HybridBelief]):
         auxiliary = self.auxiliary.watch(belief.auxiliary, observation)
         seen = evidence(self.model, self.process, self._state(main, estimate), observation)
         probability = self.detector.probability(seen)
-        alarms = torch.where(probability > self.threshold, belief.alarms + 1, 0)
+        alarms = (belief.alarms + 1) * (probability > self.threshold)
         rows = alarms >= self.patience
         if bool(rows.any()):
             state, covariance = self.auxiliary.gaussian(auxiliary, observation)
@@ -110,14 +111,15 @@ class HybridFilter(Localizer[HybridBelief]):
                 covariance=torch.where(row.unsqueeze(-1), spread, estimate.covariance),
                 batch_size=rows.shape,
             )
-        after = HybridBelief(
+        after = build(
+            HybridBelief,
+            rows.shape,
             main=main,
             auxiliary=auxiliary,
             distance=seen.distance,
             probability=probability,
-            alarms=torch.where(rows, 0, alarms),
+            alarms=alarms * ~rows,
             reset=rows,
-            batch_size=rows.shape,
         )
         return after, estimate
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer, register
-from agents.models.measurements import heard, make_measurements
+from agents.models.measurements import heard, make_measurements, nobody
 from agents.models.process import make_process
 from agents.particles import population, sampling
 from agents.particles.belief import ParticleBelief, Step, normal, own_keys
@@ -26,6 +26,7 @@ from agents.particles.likelihood import log_likelihood
 from agents.particles.proposal import guided, proposed
 from agents.particles.renewal import FLOOR, Perturb, Renewal, padded, padded_weights
 from agents.robust import RobustScreen, Screen, Trust
+from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -112,13 +113,20 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def step(
         self, belief: ParticleBelief, observation: Observation
     ) -> tuple[ParticleBelief, Estimate]:
-        key, neighbours = noise.fold(belief.key, belief.step), heard(self.believed, observation)
+        key, neighbours = (
+            noise.fold(belief.key, belief.step),
+            nobody(belief.last[..., : self.process.dim]),
+        )
+        if any(model.cooperative for model in self.models):
+            neighbours = heard(self.believed, observation)
         now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
         particles, log_weights, memory = self._updated(now)
         weighed = self.renewal.weigh(particles, log_weights, belief.count)
         particles, log_weights = self.renewal.renewed(particles, weighed, belief.count, key)
         mean = weighed.cloud.mean
-        after = ParticleBelief(
+        after = build(
+            ParticleBelief,
+            key.shape,
             particles=padded(particles, mean, self.capacity),
             log_weights=padded_weights(log_weights, self.capacity),
             count=weighed.target,
@@ -127,7 +135,6 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ess_share=weighed.ess / belief.count,
             last=mean[..., : 2 * self.process.dim],
             memory=memory,
-            batch_size=key.shape,
         )
         return after, self._estimate(weighed.cloud)
 
@@ -240,11 +247,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """The weighted cloud's mean, never surer of the position than the floor."""
         d, covariance = self.process.dim, cloud.covariance
         least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
-        return Estimate(
+        return build(
+            Estimate,
+            cloud.mean.shape[:2],
             position=cloud.mean[..., :d],
             velocity=cloud.mean[..., d : 2 * d],
             covariance=covariance[..., :d, :d] + least,
-            batch_size=cloud.mean.shape[:2],
         )
 
 

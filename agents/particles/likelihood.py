@@ -93,12 +93,8 @@ def log_likelihood(
     uncertainty adds to a range's variance is taken at the centre."""
     total = torch.zeros_like(particles[..., 0])
     d = process.dim
-    wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
     near = Neighbours(
         neighbours.position.to(total.dtype), neighbours.variance.to(total.dtype), neighbours.known
-    )
-    spread = Neighbours(
-        near.position.unsqueeze(2), near.variance.unsqueeze(2), near.known.unsqueeze(2)
     )
     for model, trust in zip(models, trusts, strict=True):
         if isinstance(model, LandmarkVectors):
@@ -111,6 +107,10 @@ def log_likelihood(
             ranges, points = model.ends(observation, near)
             total = total + range_log_likelihood(block, ranges, particles[..., :d], points, trust)
             continue
+        wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
+        spread = Neighbours(
+            near.position.unsqueeze(2), near.variance.unsqueeze(2), near.known.unsqueeze(2)
+        )
         block = model.linearize(process, particles, wide, spread, derivatives=False)
         trust = _per_particle(trust, total.dtype)
         variance = block.total_variance

@@ -98,6 +98,8 @@ def test_neighbours_are_used_where_they_are_heard(
     case = local_case
     if "cooperate" not in options_of(case.name.split(":")[0]):
         pytest.skip("does not cooperate")
+    if case.family == "wsn":
+        pytest.skip("nothing is measured between UAVs")
     d, told = case.scenario.arena.dim, []
     for o in case.run.observations:
         messages = o["messages"].unflatten(-1, (-1, 3 * d)).clone()
@@ -143,6 +145,12 @@ def half_masked(observation: Observation, tools: SimpleNamespace) -> Observation
     return tools.change(observation, **kept)
 
 
+def believed(run: Any) -> list[Any]:
+    """Beliefs, without windows of what was seen as it was seen."""
+    mains = [getattr(belief, "main", belief) for belief in run.beliefs]
+    return [getattr(belief, "reckoned", belief) for belief in mains]
+
+
 def test_values_behind_a_mask_change_nothing(case: SimpleNamespace, tools: SimpleNamespace) -> None:
     seen = [half_masked(o, tools) for o in case.run.observations]
 
@@ -156,9 +164,8 @@ def test_values_behind_a_mask_change_nothing(case: SimpleNamespace, tools: Simpl
         ]
 
     base, moved = (tools.replay(case.localizer, filled(value)) for value in (0.0, 1e6))
-    assert_unmoved(
-        (*moved.estimates, *moved.beliefs), (*base.estimates, *base.beliefs), tools.assert_same
-    )
+    assert_unmoved(moved.estimates, base.estimates, tools.assert_same)
+    assert_unmoved(believed(moved), believed(base), tools.assert_same)
 
 
 def test_silence_leaves_the_motion_model(case: SimpleNamespace, tools: SimpleNamespace) -> None:

@@ -13,7 +13,7 @@ from coloc_env.scenarios import make_scenario
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return make_scenario("indoor-v0", n_uavs=2)
+    return make_scenario("indoor-v0", n_uavs=2, anchors=4)
 
 
 @pytest.mark.parametrize("name", LOCALIZERS)
@@ -114,6 +114,7 @@ SHORTCOMINGS: dict[str, tuple[str, dict, str]] = {
     "no attitude": ("ekf", {"imu": False}, "attitude"),
     "no attitude, joint": ("ekf_joint", {"imu": False}, "attitude"),
     "no attitude, particles": ("pf500", {"imu": False}, "attitude"),
+    "no anchors": ("hpff", {}, "no distances to anchors"),
 }
 
 

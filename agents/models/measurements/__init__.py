@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, heard
+from agents.models.measurements.base import Block, Measurement, Neighbours, heard, nobody
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, Slowness
@@ -32,6 +32,7 @@ __all__ = [
     "UavRanges",
     "heard",
     "make_measurements",
+    "nobody",
 ]
 
 _MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {

@@ -25,6 +25,12 @@ class Neighbours:
     known: Bool[Tensor, "B N S"]
 
 
+def nobody(position: Float[Tensor, "*s d"]) -> Neighbours:
+    """No slots at all, for what a UAV at some position measures without others."""
+    none = position.unsqueeze(-2)[..., :0, :]
+    return Neighbours(none, none, none[..., 0] > 0)
+
+
 def heard(believed: Believed, observation: Observation) -> Neighbours:
     """Neighbours as their messages tell: past estimates, moved on at their velocity."""
     d = believed.arena.dim
