@@ -96,11 +96,8 @@ def detector_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> T
 def beyond_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> Text:
     """The study beyond the paper; its lines for the report."""
     text = ["## Beyond the paper", ""]
-    moved = {v.title: flown.runs(v, agents, runs) for v, agents in plan.sensitivity(steps)}
-    merged: dict[str, dict[str, Runs]] = {}
-    for title, there in moved.items():
-        merged.setdefault(title, {}).update(there)
-    text += _table("How σ, M, Q and the quantile move it", tables.errors(merged), 2)
+    moved = _all(flown, plan.sensitivity(steps), runs)
+    text += _table("How σ, M, Q and the quantile move it", tables.errors(moved), 2)
     taken: Kidnapped = {
         variant.title: (there, plan.kidnapped_step(variant), plan.kidnapped_uavs(variant))
         for variant, agents in plan.kidnapping(steps)

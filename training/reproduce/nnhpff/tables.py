@@ -8,6 +8,7 @@ from training.metrics import Difference
 from training.reproduce.nnhpff.detection import calibration, confusion, curve
 from training.reproduce.nnhpff.flown import Detections, Flown
 from training.reproduce.nnhpff.measures import WITHIN, Runs
+from training.reproduce.reporting import DASH
 from training.reproduce.verdicts import interval
 from training.results import short
 
@@ -22,7 +23,7 @@ def errors(found: Mapping[str, Mapping[str, Runs]]) -> Table:
     lines = []
     for title, there in found.items():
         bound = next((one.results.bound for one in there.values()), None)
-        words = title if bound is None else f"{title} (bound {bound.rmse:.3f} RMSE)"
+        words = title if bound is None else f"{title} (its model's bound: {bound.rmse:.3f} RMSE)"
         for agent, one in there.items():
             nees = one.one.nees[one.results.scored]
             lines.append(
@@ -164,7 +165,9 @@ def first_reset(one: Runs) -> str:
 
 
 def ends(x: Difference, form: Callable[[float], str] = "{:.3f}".format) -> str:
-    """A mean with its interval."""
+    """A mean with its interval; a dash for NaN."""
+    if np.isnan(x.mean):
+        return DASH
     if not np.isfinite([x.low, x.high]).all():
         return form(x.mean)
     return f"{form(x.mean)} ({form(x.low)} to {form(x.high)})"
