@@ -154,11 +154,13 @@ def test_it_is_the_least_squares_solution_and_the_kalman_filter_of_the_window(
             problem = Problem(f, g, fixes, tools.linear.fixes.std)
             if problem.there.sum() < 2:
                 continue
-            for x, p in (least_squares(problem), kalman(problem)):
+            # 1e8 m², from which the Kalman filter starts, leave a trace.
+            for reference, close in ((least_squares, 1e-6), (kalman, 1e-5)):
+                x, p = reference(problem)
                 spread = np.sqrt(np.diag(p))
-                np.testing.assert_allclose((state[i] - x) / spread, 0 * x, atol=1e-6)
+                np.testing.assert_allclose((state[i] - x) / spread, 0 * x, atol=close)
                 scale = np.outer(spread, spread)
-                np.testing.assert_allclose(covariance[i] / scale, p / scale, atol=1e-6)
+                np.testing.assert_allclose(covariance[i] / scale, p / scale, atol=close)
 
 
 def test_the_two_references_agree() -> None:
@@ -177,7 +179,7 @@ def test_the_two_references_agree() -> None:
     np.testing.assert_allclose(root @ root.T, held, atol=1e-15)
     more = Problem(f, g, np.array([[1.0, 2.0], [np.nan] * 2, [1.5, 1.0], [0.0, 4.0]]), 0.8)
     for one, other in zip(least_squares(more), kalman(more), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6)
+        np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
 def test_in_a_linear_world_once_is_enough(tools: SimpleNamespace) -> None:

@@ -90,6 +90,20 @@ def test_particles_of_a_uniform_prior_fill_the_room() -> None:
     assert (counts / 400 - 1).abs().max() < 0.25
 
 
+def test_particles_of_a_top_speed_have_any_velocity_up_to_it() -> None:
+    """Independent of where they are."""
+    scenario = make_scenario("wsn-v0", max_speed=2.0)
+    belief, _ = first(make("pf", scenario), scenario)
+    cloud = belief.particles / torch.tensor([10.0, 10.0, 4.0, 4.0])
+    cloud[..., 2:] += 0.5
+    assert (cloud > 0).all()
+    assert (cloud < 1).all()
+    counts = torch.stack([torch.histc(cloud[0, 0, :, axis], 10, 0, 1) for axis in range(4)])
+    assert (counts / 500 - 1).abs().max() < 0.25
+    apart = torch.corrcoef(cloud[0, 0].T) - torch.eye(4)
+    assert apart.abs().max() < 5 / 5000**0.5
+
+
 def test_every_uav_draws_its_own_numbers() -> None:
     scenario = make_scenario("indoor-v0", prior="uniform")
     belief, _ = first(make("pf500", scenario), scenario, 5)

@@ -18,7 +18,7 @@ from coloc_env.bounds import Bound, posterior, posterior_bound, range_informatio
 from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.information import SHARED, own_information, shared_information
 from coloc_env.bounds.mixture import error_density
-from coloc_env.bounds.process import error_model, strapdown_jacobians
+from coloc_env.bounds.process import error_model, prior_covariance, strapdown_jacobians
 from coloc_env.geometry import (
     quaternion_exp,
     quaternion_product,
@@ -368,6 +368,27 @@ def test_false_matches_inform_of_the_landmark_they_show() -> None:
     truth, seen = first_step(scenario(Landmarks(1)))
     a, b = (own_information(Landmarks(1, false_matches=x), truth, seen) for x in (0.0, 0.3))
     torch.testing.assert_close(a, b)
+
+
+def test_blocked_anchors_inform_as_those_that_are_never_in_sight() -> None:
+    """And the others as ever."""
+    error = RangeNoise(0.3, nlos=0.2)
+
+    def informed(sensor: AnchorRanging) -> Tensor:
+        truth, seen = first_step(scenario(sensor))
+        return own_information(sensor, truth, seen)
+
+    found = informed(AnchorRanging(ANCHORS, error, blocked=(1,)))
+    never = informed(AnchorRanging(ANCHORS[1:2], replace(error, nlos=1.0)))
+    others = informed(AnchorRanging((ANCHORS[0], ANCHORS[2]), error))
+    torch.testing.assert_close(found, never + others)
+    assert (found - informed(AnchorRanging(ANCHORS, error))).abs().max() > 0.1
+
+
+def test_a_top_speed_is_a_uniform_velocity() -> None:
+    task = scenario(dim=2, prior=Prior(velocity_std=7.0, kind="uniform", max_speed=3.0))
+    variances = prior_covariance(error_model(task), task).diagonal()
+    torch.testing.assert_close(variances, torch.tensor([100 / 12, 64 / 12, 3.0, 3.0]).double())
 
 
 def test_slots_of_neighbours_tell_the_same_as_a_slot_for_each() -> None:
