@@ -111,14 +111,18 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self, belief: WindowBelief, observation: Observation
     ) -> tuple[Float64[Tensor, "B N S"], Float64[Tensor, "B N E E"]]:
         window, d = self._apart(belief, observation), self.process.dim
+        arena = self.believed.arena
         reckoned = belief.reckoned
         x = reckoned.state.clone()
         x[..., :d], x[..., d : 2 * d] = self._trilaterated(window.leaves), 0.0
         known = self._reckoned_information(reckoned)
         covariance = torch.zeros_like(known)
-        for _ in range(self.iterations):
+        low, high = (x.new_tensor(end) for end in (arena.low, arena.high))
+        for iteration in range(self.iterations):
+            if iteration:  # a step too far is taken back to where a UAV can be
+                x = torch.cat((x[..., :d].clamp(low, high), x[..., d:]), -1)
             h, r, noise = self._stacked(x, window)
-            root = torch.linalg.cholesky(noise)
+            root = torch.linalg.cholesky_ex(noise).L
             whitened = torch.linalg.solve_triangular(
                 root, torch.cat((h, r.unsqueeze(-1)), -1), upper=False
             )

@@ -90,8 +90,9 @@ class FailureDetector(Learned):
     def forward(self, features: Float[Tensor, "*s 5"]) -> Float[Tensor, "*s 2"]:
         x = features
         for layer in self.hidden:
-            x = torch.tanh(functional.linear(x, layer.weight, layer.bias))
-        return functional.linear(x, self.out.weight, self.out.bias)
+            x = torch.tanh(layer(x))
+        logits: Tensor = self.out(x)
+        return logits
 
 
 def network_features(seen: Evidence) -> Float32[Tensor, "B N 5"]:

@@ -108,7 +108,7 @@ def _fits(value: Any, kind: Any) -> bool:
         kinds = [inner[0]] * len(value) if inner[-1] is Ellipsis else list(inner)
         return len(kinds) == len(value) and all(map(fits, value, kinds))
     if origin is typing.Literal:
-        return value in inner
+        return any(type(value) is type(each) and value == each for each in inner)
     if kind is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
     if kind is int:

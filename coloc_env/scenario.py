@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf
 from typing import Any, TypeVar
 
 from coloc_env.motion import Arena, Motion
@@ -33,7 +34,7 @@ class Prior:
         require(self.kind in kinds, self, "kind", f"one of {', '.join(kinds)}")
         for name in ("position_std", "velocity_std", "attitude_std"):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
-        told = self.max_speed is None or (self.kind == "uniform" and self.max_speed > 0)
+        told = self.max_speed is None or (self.kind == "uniform" and 0 < self.max_speed < inf)
         require(told, self, "max_speed", "a speed > 0, with kind='uniform'")
 
     @property
@@ -126,7 +127,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         require(self.horizon >= 1, self, "horizon", "at least one step")
-        require(self.arena.n_uavs >= 1, self.name, "n_uavs", "at least one UAV")
+        require(self.arena.n_uavs >= 1, self.arena, "n_uavs", "at least one UAV")
         require(self.reward in REWARDS, self, "reward", f"one of {', '.join(REWARDS)}")
         require(0 <= self.failure_rate <= 1, self, "failure_rate", "a probability in [0, 1]")
         known = all(0 <= uav < self.arena.n_uavs and step >= 1 for uav, step in self.failures)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from rich.console import Console
@@ -24,6 +24,7 @@ from rich.progress import track
 from rich.table import Table
 
 from agents import LOCALIZERS, make
+from agents.hybrid import HybridFilter
 from coloc_env.scenarios import make_scenario
 from training.bench_cases import Case, Timed, cases
 from training.bench_figures import FIGURES, draw
@@ -181,12 +182,17 @@ def _localizers(quick: bool) -> dict[str, Any]:
     found: dict[str, dict[str, float | None]] = {"agents": {}, "particles": {}, "teams": {}}
     chosen = tasks[:1] if quick else tasks
     for group, key, agent, n in _track(chosen, "agents"):
-        scenario = make_scenario("indoor-v0", n_uavs=n)
+        scenario = make_scenario("indoor-v0", n_uavs=n, anchors=4 * _needs_anchors(agent))
         found[group][key] = ms_per_step(make(agent, scenario), scenario, 0)
     scenario = make_scenario("indoor-v0")
     profiled = PROFILED[:1] if quick else PROFILED
     parts = {name: step_parts(make(name, scenario), scenario) for name in profiled}
     return found | {"parts": parts}
+
+
+def _needs_anchors(agent: str) -> bool:
+    """Whether an agent refuses a team without anchors."""
+    return issubclass(cast(type, LOCALIZERS[agent.split(":")[0]]), HybridFilter)
 
 
 def _track(items: Sequence[T], what: str) -> Iterable[T]:

@@ -14,7 +14,6 @@ from torchrl.objectives import LossModule
 from agents import make
 from agents.checkpoint import untrained
 from agents.failure import FailureDetector, evidence, network_features
-from agents.localizer import Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.policy import LocalizerPolicy
@@ -57,7 +56,7 @@ class Samples:
     the estimate, whether it has ``failed``, its ``error`` (m) and whether that is ``scored``
     [B, N]."""
 
-    def __init__(self, scenario: Scenario, localizer: Localizer) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.believed.sensor(AnchorRanging)
         if sensor is None or sensor.tags:
             raise ValueError(f"nnhpff: {scenario.name} has no anchors, or lever arms to them")
@@ -84,8 +83,16 @@ def samples_of(batch: TensorDictBase) -> TensorDict:
     """A flight's samples [P], whichever world, step and UAV they are of."""
     train = batch["train"]
     entries = {key: train[key].flatten(0, 2) for key in ("features", "failed", "error")}
-    rows = TensorDict(entries, entries["failed"].shape)
-    return rows[train["scored"].flatten()]
+    rows = TensorDict(entries, entries["failed"].shape)[train["scored"].flatten()]
+    if not len(rows):
+        raise ValueError("nnhpff: no step had truth and distances to anchors to learn from")
+    return rows
+
+
+def _anchors(scenario: Scenario) -> int:
+    """How many anchors the team believes in."""
+    sensor = scenario.believed.sensor(AnchorRanging)
+    return 0 if sensor is None else len(sensor.anchors)
 
 
 @register
@@ -114,16 +121,24 @@ def nnhpff(
     at_least("nnhpff", 0, score_runs=score_runs, seed=seed)
     positive("nnhpff", learning_rate=learning_rate)
     scenes = [scenario_of(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
-    crew = [(scene, make(main, scene)) for scene in scenes for main in mains.split("/")]
-    detector = untrained(FailureDetector, seed)
-    steps = min(scene.horizon for scene in scenes)
+    kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenes}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"nnhpff: variants={variants!r} must have one horizon, one number of UAVs and one of "
+            "anchors"
+        )
+    crew = [
+        (LocalizerPolicy(make(main, scene), scene, record=Samples(scene)), scene)
+        for scene in scenes
+        for main in mains.split("/")
+    ]
+    detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed), kinds
 
     def launch(epoch: int) -> SideBySide:
         first = world_seed(seed, epoch, worlds * len(crew))
         flying = []
-        for i, (scene, main) in enumerate(crew):
+        for i, (policy, scene) in enumerate(crew):
             env = CoLocEnv(scene, worlds, seed=first + i * worlds)
-            policy = LocalizerPolicy(main, scene, record=Samples(scene, main))
             flying.append(fly(env, policy, steps, compact_obs=True))
         return SideBySide(flying)
 
@@ -135,7 +150,7 @@ def nnhpff(
         samples_of,
         partial(_figures, loss),
         learning_rate=learning_rate,
-        most=worlds * len(crew) * steps * scenes[0].arena.n_uavs,
+        most=worlds * len(crew) * steps * n_uavs,
         minibatch=minibatch,
         passes=passes,
         seed=seed,
@@ -170,7 +185,7 @@ def score(detector: FailureDetector, base: str, runs: int, tell: Progress) -> Ma
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
     for case in (1, 2, 3):
-        scene = scenario_of(f"wsn-v0:case={case}")
+        scene = scenario_of(f"{base}:case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
             options = {"weights": "none"} if name == "nnhpff" else {}

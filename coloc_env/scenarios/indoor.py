@@ -72,6 +72,8 @@ def indoor(
         raise ValueError(f"{name}: motion={motion!r} is not allowed: one of {', '.join(MOTIONS)}")
     if landmarks < 0 or anchors < 0:
         raise ValueError(f"{name}: landmarks and anchors are counts ≥ 0")
+    if nlos_anchor is not None and not anchors:
+        raise ValueError(f"{name}: nlos_anchor={nlos_anchor} is not allowed: there are no anchors")
     if dt <= 0 or min(room) <= 0:
         raise ValueError(f"{name}: dt (s) and the room's sides (m) must be > 0")
     if n_uavs < 1:

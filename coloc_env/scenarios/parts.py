@@ -1,5 +1,7 @@
 """What several scenario families are made of."""
 
+import math
+
 from coloc_env.motion import Kidnapped, Motion
 
 _SPOTS = (
@@ -41,4 +43,8 @@ def kidnapped_at(
         if uavs is not None:
             raise ValueError(f"kidnapped={uavs} is not allowed: only with kidnap_at")
         return motion
+    if not dt <= time < math.inf:
+        raise ValueError(
+            f"kidnap_at={time} is not allowed: a time in s, a step's {dt:g} s at least"
+        )
     return Kidnapped(motion, round(time / dt), uavs)

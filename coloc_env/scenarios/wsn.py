@@ -1,5 +1,6 @@
 """``wsn-v0``: a robot's tag among UWB anchors in the plane (NN-HPFF paper, section 4)."""
 
+import math
 from typing import Literal
 
 from coloc_env.motion import Arena, Square
@@ -43,12 +44,12 @@ def wsn(
     ranges with a bias of ``nlos_bias`` m on average; ``nlos_anchor``: the anchor all of whose
     ranges have one. At ``kidnap_at`` s everyone is put on the room's other side.
     """
-    if min(r_true, CASES[case][0] if r_believed is None else r_believed) <= 0:
-        raise ValueError("r_true and r_believed are variances in m² > 0")
     variance, acceleration = CASES[case]
     variance = variance if r_believed is None else r_believed
     acceleration = acceleration if q is None else q
-    if acceleration < 0:
+    if not 0 < min(r_true, variance) <= max(r_true, variance) < math.inf:
+        raise ValueError("r_true and r_believed are variances in m² > 0")
+    if not 0 <= acceleration < math.inf:
         raise ValueError(f"q={acceleration} is not allowed: a variance in m²/s⁴ ≥ 0")
     arena = Arena(2, n_uavs, 0.1, (0.0, 0.0), (_SIDE, _SIDE))
     places = anchor_places(anchors, arena.high)

@@ -89,7 +89,7 @@ def test_gradient_is_that_of_finite_differences() -> None:
 def recorded(scenario: Scenario, main: str, worlds: int = 3, steps: int = 40) -> Any:
     """A flight of a filter as trainings record it."""
     localizer = make(main, scenario)
-    policy = LocalizerPolicy(localizer, scenario, record=Samples(scenario, localizer))
+    policy = LocalizerPolicy(localizer, scenario, record=Samples(scenario))
     (batch,) = fly(CoLocEnv(scenario, worlds, seed=5), policy, steps, compact_obs=True)
     return batch
 
@@ -350,4 +350,4 @@ def test_ranges_with_lever_arms_are_no_samples() -> None:
     sensor = replace(scenario.believed_sensors[0], tags=(((0.1, 0.0),),))  # type: ignore[call-arg]
     armed = replace(scenario, believed_sensors=(sensor,))
     with pytest.raises(ValueError, match="wsn-v0 has no anchors, or lever arms to them"):
-        Samples(armed, make("ekf", scenario))
+        Samples(armed)
