@@ -17,7 +17,7 @@ from training.reproduce.verdicts import interval
 
 # Colours that all eyes tell apart, the same in every figure.
 _COLOURS = {"pf": "#0072B2", "hpff": "#E69F00", "nnhpff": "#D55E00", "ekf": "#009E73"}
-_OTHERS = ("#CC79A7", "#56B4E9", "#882255", "#7F7F1F")
+_OTHERS = ("#CC79A7", "#56B4E9", "#882255", "#7F7F1F", "#332288", "#AA4499", "#999999")
 _NAMES = {"pf": "PF", "hpff": "HPFF", "nnhpff": "NN-HPFF"}
 
 

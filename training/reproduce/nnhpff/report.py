@@ -54,7 +54,7 @@ def paper_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> Text
         drawings[FILES[0]] = partial(figures.learning, flown.learning)
     for name, (title, there) in zip(FILES[1:4], own.items(), strict=True):
         if there:
-            drawings[name] = partial(figures.case, title.capitalize(), there)
+            drawings[name] = partial(figures.case, title[0].upper() + title[1:], there)
     if any(titled.values()):
         drawings[FILES[4]] = partial(figures.ales, titled)
     text += _draw(drawings, folder)
