@@ -9,7 +9,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Box
-from coloc_env.sensors.base import require, squared_norm
+from coloc_env.sensors.base import require
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
 
@@ -59,8 +59,7 @@ class Network:
             reach = alive.unsqueeze(2) & alive.unsqueeze(3)
             reach.diagonal(dim1=-2, dim2=-1).fill_(False)
             if self.radius is not None:
-                apart = position.unsqueeze(2) - position.unsqueeze(3)
-                reach &= squared_norm(apart) <= self.radius**2
+                reach &= _squared_distances(position) <= self.radius**2
             if self.walls:
                 reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
             return index, reach
@@ -142,6 +141,15 @@ class Network:
         receiver = torch.arange(n, device=keys.device).unsqueeze(-1)
         directed = noise.fold(keys[..., None, None], receiver * n + neighbours)
         return reach & (noise.uniform(directed, "network.loss", 1)[..., 0] >= self.loss)
+
+
+def _squared_distances(position: Float64[Tensor, "R K N d"]) -> Float64[Tensor, "R K N N"]:
+    """Between all UAVs, in m², one component at a time."""
+    first, *rest = (c.unsqueeze(2) - c.unsqueeze(3) for c in position.unbind(-1))
+    squared = first.mul_(first)
+    for apart in rest:
+        squared.add_(apart.mul_(apart))
+    return squared
 
 
 def _sorted(order: Int64[Tensor, "*s n"]) -> Int64[Tensor, "*s n"]:

@@ -196,7 +196,7 @@ def sense(
         alive=alive,
         failed=steps.unsqueeze(-1) == fails_at,
         scored=scored,
-        unheard=~heard.repeat_interleave(action_width(scenario), -1),
+        unheard=(~heard).repeat_interleave(action_width(scenario), -1),
         heard=leaves["links"].clone(),
         senders=None if dense else neighbours,
         leaves=leaves,

@@ -51,8 +51,9 @@ class Ins(Sensor):
         each = (2, _COSINES, arena.n_uavs, arena.dim)
         drawn = noise.uniform(keys, "ins.bias", math.prod(each)).double().unflatten(-1, each)
         rate = torch.tan(math.pi * (drawn[:, 0] - 0.5)) / self.bias_time
-        turn = torch.remainder(rate * arena.dt, 2 * math.pi)  # whole turns show at no step
-        return {"turn": turn, "phase": 2 * math.pi * drawn[:, 1]}
+        turn = torch.remainder(rate * arena.dt + math.pi, 2 * math.pi) - math.pi  # as far as shows
+        phase = 2 * math.pi * drawn[:, 1]
+        return {"turn": turn.to(torch.float32), "phase": phase.to(torch.float32)}
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         now, before, dt = window.motion, window.before, window.layout.arena.dt
@@ -67,11 +68,10 @@ class Ins(Sensor):
 
     def _biases(self, window: Window, placed: dict[str, Tensor]) -> Float32[Tensor, "R K N d"]:
         """The biases at the window's steps."""
-        steps = window.steps[..., None, None].double()
+        steps = window.steps[..., None, None].to(torch.float32)
         total = torch.zeros((), device=steps.device)
-        for turn, phase in zip(
-            *(placed[name].unbind(1) for name in ("turn", "phase")), strict=True
-        ):
-            angle = steps * turn.unsqueeze(1) + phase.unsqueeze(1)
-            total = total + angle.to(torch.float32).cos_()
+        waves = (placed[name].unbind(1) for name in ("turn", "phase"))
+        for turn, phase in zip(*waves, strict=True):
+            angle = (steps * turn.unsqueeze(1)).add_(phase.unsqueeze(1))
+            total = total + angle.cos_()
         return total * (self.bias * (2 / _COSINES) ** 0.5)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.sensors.base import require
+from coloc_env.sensors.base import Window, require
 from coloc_env.sensors.held import held_uniform
 
 
@@ -51,20 +51,15 @@ class RangeNoise:
         require(lasting, self, "nlos_time", "a time in s > 0")
 
     def obstructed(
-        self,
-        rows: Int64[Tensor, "R"],
-        first: Int64[Tensor, "R"],
-        count: int,
-        links: Int64[Tensor, "*l"],
-        stream: str,
-        dt: float,
+        self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
     ) -> Bool[Tensor, "R K *l"] | None:
-        """Which links are NLOS in ``count`` steps from each row's ``first`` on; None where every
-        step is for itself."""
-        if self.nlos_time is None or not self.nlos:
+        """Which of the numbered links are NLOS, ``latency`` steps before each of the window's; None
+        where every step is for itself."""
+        if self.nlos_time is None:
             return None
-        drawn = held_uniform(rows, first, count, links, f"{stream}.nlos", self.nlos_time / dt)
-        return drawn < self.nlos
+        first, count = window.steps[:, 0] - latency, window.steps.shape[1]
+        time = self.nlos_time / window.layout.arena.dt
+        return held_uniform(window.rows, first, count, links, f"{stream}.nlos", time) < self.nlos
 
     def sample(
         self,

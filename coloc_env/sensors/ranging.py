@@ -42,13 +42,6 @@ def tag_distances(
     return squared.sqrt_()
 
 
-def _pairs(others: Int64[Tensor, "*s S"], n: int, t: int) -> Int64[Tensor, "*s N S T T"]:
-    """One number for each pair of tags, the same from both ends; ``others`` […, N or 1, S]."""
-    index = torch.arange(n * t, device=others.device).view(n, 1, t, 1)
-    other = others[..., None, None] * t + torch.arange(t, device=others.device)
-    return torch.minimum(index, other) * (n * t) + torch.maximum(index, other)
-
-
 @dataclass(frozen=True)
 class Ranging(Sensor):
     """Leaves ``ranges`` and ``range_mask`` [S · T · T]: distance in m to each neighbour slot.
@@ -82,17 +75,17 @@ class Ranging(Sensor):
         motion, keys = window.delayed(self.latency)
         tags, n, t = tag_positions(motion, self.tags), window.layout.arena.n_uavs, self.n_tags
         others = window.neighbours
-        dense = others.shape[-1] == n
-        pair = _pairs(others, n, t)
-        distance = tag_distances(tags, None if dense else others)
-        link = noise.fold(keys[..., None, None, None, None], pair)
-        every = pair[0, 0] if dense else _pairs(torch.arange(n, device=keys.device), n, t)
-        first, count, dt = window.steps[:, 0] - self.latency, keys.shape[1], window.layout.arena.dt
-        late = self.noise.obstructed(window.rows, first, count, every, "ranging", dt)
-        if late is not None and not dense:
-            slots = others[..., None, None].expand(*others.shape, t, t)
-            late = late.gather(3, slots)
-        ranges, lost = self.noise.sample(distance, link, "ranging", obstructed=late)
+        index = torch.arange(n * t, device=keys.device).view(n, 1, t, 1)
+        other = others[..., None, None] * t + torch.arange(t, device=keys.device)
+        lower, upper = torch.minimum(index, other), torch.maximum(index, other)
+        distance = tag_distances(tags, None if others.shape[-1] == n else others)
+        link = noise.fold(keys[..., None, None, None, None], lower * (n * t) + upper)
+        pairs = torch.arange(n * t * (n * t + 1) // 2, device=keys.device)
+        obstructed = self.noise.obstructed(window, pairs, "ranging", self.latency)
+        if obstructed is not None:
+            among = (upper * (upper + 1) // 2 + lower).expand(distance.shape)
+            obstructed = obstructed.gather(2, among.flatten(2)).view(distance.shape)
+        ranges, lost = self.noise.sample(distance, link, "ranging", obstructed=obstructed)
         mask = window.reach[..., None, None].expand(ranges.shape)
         if self.latency:
             mask = mask & (window.steps >= self.latency)[..., None, None, None, None]
@@ -155,9 +148,8 @@ class AnchorRanging(Sensor):
         if self.blocked:
             blocked = torch.zeros(len(self.anchors), dtype=torch.bool, device=distance.device)
             blocked[list(self.blocked)] = True
-        first, steps, dt = window.steps[:, 0], window.steps.shape[1], window.layout.arena.dt
-        late = self.noise.obstructed(window.rows, first, steps, index, "anchor_ranging", dt)
-        ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked, late)
+        obstructed = self.noise.obstructed(window, index, "anchor_ranging")
+        ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked, obstructed)
         mask = window.alive[..., None, None].expand(ranges.shape)
         if self.radius is not None:
             mask = mask & (distance <= self.radius)
