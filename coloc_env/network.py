@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.sensors.base import require, squared_norm
+from coloc_env.motion import Box
+from coloc_env.sensors.base import require
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
-Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,8 @@ class Network:
 
     ``radius``: reach in m (None: everybody). ``walls``: solid boxes ((low), (high)) in m that block
     the line of sight. ``loss``: probability that one directed link carries nothing in one step.
+    ``failure``: probability that a link is broken in one step: neither ranges nor messages pass,
+    either way.
     ``delay``: further steps a message needs beyond the one it always takes. ``max_neighbours``:
     teams of up to this size have one slot per UAV; in larger ones each UAV has this many slots, for
     the nearest UAVs in reach.
@@ -30,10 +32,12 @@ class Network:
     loss: float = 0.0
     delay: int = 0
     max_neighbours: int = 16
+    failure: float = 0.0
 
     def __post_init__(self) -> None:
         require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
         require(0 <= self.loss <= 1, self, "loss", "a probability in [0, 1]")
+        require(0 <= self.failure <= 1, self, "failure", "a probability in [0, 1]")
         require(self.delay >= 0, self, "delay", "a number of steps ≥ 0")
         require(self.max_neighbours >= 1, self, "max_neighbours", "at least one slot")
 
@@ -55,8 +59,7 @@ class Network:
             reach = alive.unsqueeze(2) & alive.unsqueeze(3)
             reach.diagonal(dim1=-2, dim2=-1).fill_(False)
             if self.radius is not None:
-                apart = position.unsqueeze(2) - position.unsqueeze(3)
-                reach &= squared_norm(apart) <= self.radius**2
+                reach &= _squared_distances(position) <= self.radius**2
             if self.walls:
                 reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
             return index, reach
@@ -110,6 +113,21 @@ class Network:
         assert blocked is not None
         return blocked
 
+    def unbroken(
+        self,
+        keys: Int64[Tensor, "R K"],
+        neighbours: Int64[Tensor, "#R #K N S"],
+        reach: Bool[Tensor, "R K N S"],
+    ) -> Bool[Tensor, "R K N S"]:
+        """``reach`` without the links that are broken in each step, the same ones at both ends."""
+        if not self.failure:
+            return reach
+        n = reach.shape[2]
+        own = torch.arange(n, device=keys.device).unsqueeze(-1)
+        pair = torch.minimum(own, neighbours) * n + torch.maximum(own, neighbours)
+        undirected = noise.fold(keys[..., None, None], pair)
+        return reach & (noise.uniform(undirected, "network.failure", 1)[..., 0] >= self.failure)
+
     def links(
         self,
         keys: Int64[Tensor, "R K"],
@@ -123,6 +141,15 @@ class Network:
         receiver = torch.arange(n, device=keys.device).unsqueeze(-1)
         directed = noise.fold(keys[..., None, None], receiver * n + neighbours)
         return reach & (noise.uniform(directed, "network.loss", 1)[..., 0] >= self.loss)
+
+
+def _squared_distances(position: Float64[Tensor, "R K N d"]) -> Float64[Tensor, "R K N N"]:
+    """Between all UAVs, in m², one component at a time."""
+    first, *rest = (c.unsqueeze(2) - c.unsqueeze(3) for c in position.unbind(-1))
+    squared = first.mul_(first)
+    for apart in rest:
+        squared.add_(apart.mul_(apart))
+    return squared
 
 
 def _sorted(order: Int64[Tensor, "*s n"]) -> Int64[Tensor, "*s n"]:

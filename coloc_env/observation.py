@@ -115,7 +115,8 @@ def observation_space(leaves: Mapping[str, Leaf]) -> gym.spaces.Dict:
 
 
 def action_bounds(arena: Arena) -> tuple[list[float], list[float]]:
-    """Bounds of the flat action: twice the arena's extent, ±50 m/s, log-std within ±10.
+    """Bounds of the flat action: twice the arena's extent, log-std within ±10, and ±50 m/s, or so
+    much as crosses the arena's longest side in 50 s.
 
     They describe where sensible estimates lie (and what samples look like); a finite estimate
     beyond them is scored, not refused.
@@ -125,7 +126,8 @@ def action_bounds(arena: Arena) -> tuple[list[float], list[float]]:
         low.append(a - 0.5 * (b - a))
         high.append(b + 0.5 * (b - a))
     dim = arena.dim
-    return low + [-50.0] * dim + [-10.0] * dim, high + [50.0] * dim + [10.0] * dim
+    fast = max(50.0, *((b - a) / 50.0 for a, b in zip(arena.low, arena.high, strict=True)))
+    return low + [-fast] * dim + [-10.0] * dim, high + [fast] * dim + [10.0] * dim
 
 
 def state_bounds(scenario: Scenario) -> tuple[list[float], list[float]]:

@@ -79,7 +79,22 @@ class ConstantVelocity:
         require(not self.held or self.damping is None, self, "held", "without damping")
 
 
-Process = Inertial | Wheeled | ConstantVelocity
+@dataclass(frozen=True)
+class InsDriven:
+    """Dead reckoning with the velocity that the INS says.
+
+    Its error counts as white, of variance ``std² + bias_share · bias²`` per axis (m²/s², std and
+    bias those of the believed ``Ins``): a bias that lasts adds up faster than white noise of the
+    same size does.
+    """
+
+    bias_share: float = 2.0
+
+    def __post_init__(self) -> None:
+        require(0 <= self.bias_share < inf, self, "bias_share", "a number ≥ 0")
+
+
+Process = Inertial | Wheeled | ConstantVelocity | InsDriven
 S = TypeVar("S", bound=Sensor)
 
 
@@ -108,6 +123,7 @@ class Scenario:
 
     ``failure_rate``: probability that a UAV fails, at a uniformly drawn step, during an episode;
     ``failures``: ((uav, step), …) for failures at given steps. ``reward``: one of ``REWARDS``.
+    ``guides``: the first so many UAVs know where they are and are not scored.
     """
 
     name: str
@@ -123,6 +139,7 @@ class Scenario:
     failure_rate: float = 0.0
     failures: tuple[tuple[int, int], ...] = ()
     reward: str = "error"
+    guides: int = 0
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -132,6 +149,8 @@ class Scenario:
         require(0 <= self.failure_rate <= 1, self, "failure_rate", "a probability in [0, 1]")
         known = all(0 <= uav < self.arena.n_uavs and step >= 1 for uav, step in self.failures)
         require(known, self, "failures", "((uav index, step ≥ 1), …)")
+        fewer = 0 <= self.guides < self.arena.n_uavs
+        require(fewer, self, "guides", f"from 0 to fewer than the {self.arena.n_uavs} UAVs")
 
     @cached_property
     def layout(self) -> Layout:

@@ -159,8 +159,10 @@ def sense(
     fails_at = fails_at.unsqueeze(1)
     alive = steps.unsqueeze(-1) < fails_at
     neighbours, reach = network.neighbours(motion.position, alive)
+    reach = network.unbroken(step_keys, neighbours, reach)
     window = Window(
         layout=scenario.layout,
+        rows=keys,
         motion=motion,
         before=before,
         keys=step_keys,
@@ -179,6 +181,9 @@ def sense(
     heard = network.links(step_keys, neighbours, reach)
     leaves["links"] = heard.to(torch.float32)
     dense = network.dense(arena.n_uavs)
+    scored = alive if moved.valid is None else alive & moved.valid
+    if scenario.guides:
+        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.guides)
     if not dense:
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
     sensed = Sensed(
@@ -190,8 +195,8 @@ def sense(
         over=steps >= scenario.horizon,
         alive=alive,
         failed=steps.unsqueeze(-1) == fails_at,
-        scored=alive if moved.valid is None else alive & moved.valid,
-        unheard=~heard.repeat_interleave(action_width(scenario), -1),
+        scored=scored,
+        unheard=(~heard).repeat_interleave(action_width(scenario), -1),
         heard=leaves["links"].clone(),
         senders=None if dense else neighbours,
         leaves=leaves,

@@ -1,4 +1,4 @@
-"""What a team believes of its motion: one interface, three models, batched over anything.
+"""What a team believes of its motion: one interface, four models, batched over anything.
 
 A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the
 tangent space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position
@@ -17,7 +17,7 @@ from coloc_env import scenario as believed_processes
 from coloc_env.geometry import concat, cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
-from coloc_env.sensors import GRAVITY, Imu, Odometry
+from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry
 
 
 class Process(ABC):
@@ -87,7 +87,7 @@ class Process(ABC):
     ) -> Float[Tensor, "*s S"]:
         """``x ⊞ δ``."""
         if not self.attitude_size:
-            return x + delta
+            return x + self._linear(delta)
         d, a = self.dim, self.attitude_size
         e = self.attitude_error
         assert e is not None
@@ -277,6 +277,61 @@ class WheeledProcess(Process):
         return torch.cat((delta[..., :2], torch.zeros_like(delta[..., :2])), -1)
 
 
+class InsProcess(Process):
+    """x = [p, v], u = the velocity that the INS says: p' = p + u dt, v' = u.
+
+    The velocity is what the INS says, not an estimated quantity: the error is δp.
+    """
+
+    def __init__(
+        self, dim: int, dt: float, ins: Ins, settings: believed_processes.InsDriven
+    ) -> None:
+        super().__init__(dim, dt)
+        self.std = (ins.std**2 + settings.bias_share * ins.bias**2) ** 0.5
+        self.state_size, self.error_size, self.noise_size = 2 * dim, dim, dim
+
+    def _initial(
+        self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s 2d"]
+    ) -> tuple[Float[Tensor, "*s 2d"], Float[Tensor, "*s d d"]]:
+        return mean[..., : self.state_size], torch.diag_embed(std[..., : self.dim] ** 2)
+
+    def inputs(self, observation: Observation) -> Float[Tensor, "B N d"]:
+        return observation["ins"].double()
+
+    def propagate(
+        self,
+        x: Float[Tensor, "*s 2d"],
+        u: Float[Tensor, "*s d"],
+        dt: Float[Tensor, "*s"],
+        noise: Float[Tensor, "*s d"] | None = None,
+    ) -> Float[Tensor, "*s 2d"]:
+        if noise is not None:
+            u = u + self.std * noise
+        dt = dt.unsqueeze(-1)
+        velocity = torch.where(dt > 0, u, x[..., self.dim :])
+        return concat((x[..., : self.dim] + u * dt, velocity))
+
+    def retreat(
+        self, x: Float[Tensor, "*s 2d"], u: Float[Tensor, "*s d"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s 2d"]:
+        return concat((x[..., : self.dim] - u * dt.unsqueeze(-1), x[..., self.dim :]))
+
+    def linearize(
+        self, x: Float[Tensor, "*s 2d"], u: Float[Tensor, "*s d"], dt: Float[Tensor, "*s"]
+    ) -> tuple[Float[Tensor, "*s d d"], Float[Tensor, "*s d d"]]:
+        eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
+        q = (self.std * dt[..., None, None]) ** 2 * eye
+        return eye.expand_as(q), q
+
+    def boxminus(
+        self, x: Float[Tensor, "*s 2d"], y: Float[Tensor, "*s 2d"]
+    ) -> Float[Tensor, "*s d"]:
+        return x[..., : self.dim] - y[..., : self.dim]
+
+    def _linear(self, delta: Float[Tensor, "*s d"]) -> Float[Tensor, "*s 2d"]:
+        return torch.cat((delta, torch.zeros_like(delta)), -1)
+
+
 class ConstantVelocityProcess(Process):
     """x = [p, v]; white acceleration, and optionally a pull of the velocity to zero
     (Ornstein-Uhlenbeck, exactly discretized); or acceleration that is held over each step."""
@@ -363,6 +418,11 @@ def make_process(believed: Believed) -> Process:
         if imu is None:
             raise ValueError("the believed motion is inertial, but the team has no IMU")
         return InertialProcess(arena.dt, imu, settings)
+    if isinstance(settings, believed_processes.InsDriven):
+        ins = believed.sensor(Ins)
+        if ins is None:
+            raise ValueError("the believed motion is driven by an INS, but the team has none")
+        return InsProcess(arena.dim, arena.dt, ins, settings)
     odometry = believed.sensor(Odometry)
     if odometry is None:
         raise ValueError("the believed motion is wheeled, but the team has no odometry")

@@ -8,7 +8,7 @@ from coloc_env.bounds.information import SHARED, own_information, shared_informa
 from coloc_env.geometry import rotate_by
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
-from coloc_env.sensors import Imu, Odometry, Sensor
+from coloc_env.sensors import Imu, Ins, Odometry, Sensor
 
 
 def expected_information(
@@ -20,8 +20,8 @@ def expected_information(
 ) -> tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B m m"] | None]:
     """``E Σ Hᵀ R⁻¹ H`` about single UAVs' states, and about the team's (None: no sensor has it).
 
-    The expectation is the mean over the truth moved by +drawn and −drawn state errors. IMU and
-    odometry drive the process, and count there.
+    The expectation is the mean over the truth moved by +drawn and −drawn state errors. IMU, INS
+    and odometry drive the process, and count there.
     """
     size, n = pose.shape[1], drawn.shape[1]
     own, shared = torch.zeros(*drawn.shape, size, dtype=torch.float64), None
@@ -32,7 +32,7 @@ def expected_information(
             joint = torch.einsum("de,bidjf,fg->biejg", pose, joint, pose)
             joint = joint.reshape(-1, n * size, n * size)
             shared = joint if shared is None else shared + joint
-        elif not isinstance(sensor, Imu | Odometry):
+        elif not isinstance(sensor, Imu | Ins | Odometry):
             own += pose.mT @ _mean(own_information(sensor, truth, seen)) @ pose
     return own, shared
 

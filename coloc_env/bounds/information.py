@@ -25,6 +25,7 @@ from coloc_env.sensors import (
     Height,
     LandmarkBearings,
     Landmarks,
+    PositionFix,
     Ranging,
     Sensor,
     UavBearings,
@@ -97,6 +98,17 @@ def _anchor_ranging(
         told[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
     weights = arrived * told
     return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
+
+
+@own_information.register
+def _position_fix(
+    sensor: PositionFix, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """z = p + N(0, σ² I)."""
+    dim = truth.position.shape[-1]
+    pose = torch.eye(dim, 6 if dim == 3 else 3, dtype=torch.float64, device=truth.position.device)
+    rows = pose.expand(*truth.position.shape[:2], 1, -1, -1)
+    return _gram(rows, _mask(seen, "position_fix_mask") / max(sensor.std, EXACT) ** 2)
 
 
 @own_information.register

@@ -1,6 +1,7 @@
 """Fisher information of one range about the true distance, for any noise a scenario can have."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,8 +21,13 @@ def range_information(noise: RangeNoise) -> float:
 
     The range is distance + error, so this is the information about the distance (Kay 1993, p. 58);
     for Gaussian noise it is 1/σ². No estimator extracts more from a mixture, and one range alone
-    gives less: which ranges are outliers has to be told from the others.
+    gives less: which ranges are outliers has to be told from the others. Where NLOS lasts
+    (``nlos_time``) the ranges before tell much of that: which are NLOS is then taken as known.
     """
+    if noise.nlos_time is not None:
+        known = (replace(noise, nlos=share, nlos_time=None) for share in (0.0, 1.0))
+        clear, late = map(range_information, known)
+        return (1 - noise.nlos) * clear + noise.nlos * late
     _, density, slope = error_density(noise)
     supported = density > 1e-14 * density.max()  # below it the numbers are rounding errors
     step = 1 / density.sum()

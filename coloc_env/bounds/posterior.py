@@ -10,8 +10,8 @@ over the joint error state of the team, all cross-information included: the boun
 pools all its measurements at once, whatever the radio loses or delays of its messages.
 
 **Which bound this is.** The one conditional on each world (its map, the masks that say which
-measurements arrived, its IMU or odometry readings), its J⁻¹ averaged over worlds. F and Q are taken
-at the truth. The expectation is over what the past leaves open (conditional bound: Zuo, Niu,
+measurements arrived, its IMU, INS or odometry readings), its J⁻¹ averaged over worlds. F and Q are
+taken at the truth. The expectation is over what the past leaves open (conditional bound: Zuo, Niu,
 Varshney, IEEE Trans. Signal Processing 59(1), 2011): states spread by (J⁻)⁻¹ about an estimate that
 is itself so spread about the truth, hence the truth moved by N(0, 2 (J⁻)⁻¹). One antithetic pair of
 draws a step, functions of seed and step, stands for it. At the truth alone there would be no bound
@@ -21,8 +21,8 @@ rule out large errors.
 - For linear Gaussian models it is exact and attained. Else it holds as far as the posterior is near
   a Gaussian of covariance J⁻¹, and is tight once that is small against distances and a radian.
 - Of noise that is not Gaussian only the Fisher information enters: the bound holds, but a filter
-  with few measurements per step does not reach it.
-- IMU and odometry noise, of known statistics, is process noise. With ``ConstantVelocity`` the
+  with few measurements per step does not reach it. Which ranges are NLOS is told where that lasts.
+- IMU, INS and odometry noise, of known statistics, is process noise. With ``ConstantVelocity`` the
   process noise is the model's: scripted motion is smoother, and a filter may do better than that.
 - What visibility itself tells of the position is left out; a delayed measurement counts as if made
   when it arrives; which landmark a false match shows is told (see ``information``); a uniform prior

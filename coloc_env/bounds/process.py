@@ -4,6 +4,7 @@ Errors are on the manifold, attitude on the right: R exp(δθ). Each model gives
 one step apart, the transition F and the covariance Q of what the step adds, both [B, N, E, E].
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TypeVar
@@ -15,8 +16,8 @@ from torch import Tensor
 from coloc_env.bounds.mixture import EXACT
 from coloc_env.geometry import cross_matrix, rotation_between, rotation_matrix, unrotate
 from coloc_env.motion import Kinematics
-from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Scenario, Wheeled
-from coloc_env.sensors import GRAVITY, Imu, Odometry, Sensor
+from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
+from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
 from coloc_env.sensors.base import Recorded
 
 Jacobians = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B N E E"]]
@@ -103,6 +104,38 @@ class WheeledErrors(ErrorModel):
 
 
 @dataclass(frozen=True)
+class InsErrors(ErrorModel):
+    """δp, and the INS's bias δb where it truly has one, from an INS: p + (u − b − noise) dt, and
+    b₊ = e^(−dt/τ) b + noise that keeps its variance.
+
+    A step's sample carries the bias of the step's end.
+    """
+
+    ins: Ins
+
+    def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
+        return [*position, *self.dim * [self.ins.bias]] if self.ins.bias else position
+
+    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+        kept = math.exp(-self.dt / self.ins.bias_time)
+        white, fresh = (self.ins.std * self.dt) ** 2, (1 - kept**2) * self.ins.bias**2
+        if self.ins.bias:
+            f = torch.tensor(((1.0, -kept * self.dt), (0.0, kept)), dtype=torch.float64)
+            push = torch.tensor((-self.dt, 1.0), dtype=torch.float64)
+            q = fresh * push.outer(push) + white * torch.tensor(((1, 0), (0, 0))).double()
+        else:
+            f, q = torch.ones(1, 1).double(), torch.full((1, 1), white).double()
+        axes = torch.eye(self.dim, dtype=torch.float64)
+        f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
+        shape = (*now.position.shape[:2], *f.shape)
+        return f.expand(shape), q.expand(shape)
+
+    def pose(self) -> Float64[Tensor, "D E"]:
+        pose = torch.eye(6 if self.dim == 3 else 3, self.dim, dtype=torch.float64)
+        return torch.nn.functional.pad(pose, (0, self.dim)) if self.ins.bias else pose
+
+
+@dataclass(frozen=True)
 class ConstantVelocityErrors(ErrorModel):
     """(δp, δv): ṗ = v, v̇ = −v/τ + white noise, integrated exactly over a step (with damping the
     integrated Ornstein–Uhlenbeck process), or noise that is held over the step. Attitude, where a
@@ -133,13 +166,15 @@ class ConstantVelocityErrors(ErrorModel):
 
 
 def error_model(scenario: Scenario) -> ErrorModel:
-    """The model of a scenario's process, with the noise of its *true* IMU or odometry."""
+    """The model of a scenario's process, with the noise of its *true* IMU, INS or odometry."""
     dim, dt = scenario.arena.dim, scenario.arena.dt
     match scenario.process:
         case Inertial():
             return InertialErrors(dim, dt, _true(scenario, Imu))
         case Wheeled():
             return WheeledErrors(dim, dt, _true(scenario, Odometry))
+        case InsDriven():
+            return InsErrors(dim, dt, _true(scenario, Ins))
         case ConstantVelocity() as process:
             return ConstantVelocityErrors(dim, dt, process)
 

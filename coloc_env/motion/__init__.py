@@ -6,7 +6,7 @@ position, in closed form. Positions in m, times in s, angles in rad, z up.
 """
 
 from coloc_env.motion.aggressive import Aggressive
-from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
+from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
 from coloc_env.motion.curves import Circle, FigureEight, Helix
 from coloc_env.motion.formation import FormationChange
 from coloc_env.motion.kidnapped import Kidnapped
@@ -35,6 +35,7 @@ __all__ = [
     "MOTIONS",
     "Aggressive",
     "Arena",
+    "Box",
     "Carry",
     "Circle",
     "FigureEight",

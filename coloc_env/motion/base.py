@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 Carry = dict[str, Tensor]
+Box = tuple[tuple[float, ...], tuple[float, ...]]  # lowest and highest corner, m
 
 
 @dataclass(frozen=True)

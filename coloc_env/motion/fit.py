@@ -1,6 +1,6 @@
 """Whether a motion's settings fit its arena: checks that name the setting and what is allowed."""
 
-from coloc_env.motion.base import Arena, Motion
+from coloc_env.motion.base import Arena, Box, Motion
 
 
 def positive(motion: Motion, *settings: str) -> None:
@@ -58,6 +58,19 @@ def altitude(motion: Motion, arena: Arena, height: float | None, swing: float = 
             f"must be in [{low + swing:g}, {high - swing:g}]"
         )
     return height
+
+
+def inside(motion: Motion, setting: str, boxes: tuple[Box, ...], arena: Arena) -> None:
+    """Every box must have a volume, and lie in the arena."""
+    for box in boxes:
+        low, high = box
+        fits = len(low) == len(high) == arena.dim
+        limits = zip(arena.low, low, high, arena.high, strict=False)
+        if not (fits and all(a <= b < c <= d for a, b, c, d in limits)):
+            raise ValueError(
+                f"{_name(motion, setting)}: {box} is no box ((low), (high)) in the arena from "
+                f"{arena.low} to {arena.high}"
+            )
 
 
 def only_3d(motion: Motion, arena: Arena) -> None:

@@ -4,8 +4,10 @@ from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
 from coloc_env.sensors.height import Height
 from coloc_env.sensors.imu import GRAVITY, Imu
+from coloc_env.sensors.ins import Ins
 from coloc_env.sensors.landmarks import Landmarks
 from coloc_env.sensors.odometry import Odometry
+from coloc_env.sensors.position_fix import PositionFix
 from coloc_env.sensors.range_noise import RangeNoise
 from coloc_env.sensors.ranging import AnchorRanging, Ranging
 from coloc_env.sensors.slow_flight import SlowFlight
@@ -15,11 +17,13 @@ __all__ = [
     "AnchorRanging",
     "Height",
     "Imu",
+    "Ins",
     "LandmarkBearings",
     "Landmarks",
     "Layout",
     "Leaf",
     "Odometry",
+    "PositionFix",
     "RangeNoise",
     "Ranging",
     "Recorded",

@@ -38,13 +38,15 @@ class Window:
     """What sensors see of R worlds over K steps: truth (float64), who reaches whom, and keys.
 
     ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
-    step 0). ``keys`` are the (row, step) noise keys. Slot ``s`` of UAV ``i`` holds UAV
-    ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives, message loss aside.
+    step 0). ``rows`` are the rows' noise keys, ``keys`` those of (row, step). Slot ``s`` of UAV
+    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives,
+    message loss aside.
     """
 
     layout: Layout
     motion: Kinematics
     before: Kinematics
+    rows: Int64[Tensor, "R"]
     keys: Int64[Tensor, "R K"]
     steps: Int64[Tensor, "R K"]
     alive: Bool[Tensor, "R K N"]

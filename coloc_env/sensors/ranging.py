@@ -77,10 +77,15 @@ class Ranging(Sensor):
         others = window.neighbours
         index = torch.arange(n * t, device=keys.device).view(n, 1, t, 1)
         other = others[..., None, None] * t + torch.arange(t, device=keys.device)
-        pair = torch.minimum(index, other) * (n * t) + torch.maximum(index, other)
+        lower, upper = torch.minimum(index, other), torch.maximum(index, other)
         distance = tag_distances(tags, None if others.shape[-1] == n else others)
-        link = noise.fold(keys[..., None, None, None, None], pair)
-        ranges, lost = self.noise.sample(distance, link, "ranging")
+        link = noise.fold(keys[..., None, None, None, None], lower * (n * t) + upper)
+        pairs = torch.arange(n * t * (n * t + 1) // 2, device=keys.device)
+        obstructed = self.noise.obstructed(window, pairs, "ranging", self.latency)
+        if obstructed is not None:
+            among = (upper * (upper + 1) // 2 + lower).expand(distance.shape)
+            obstructed = obstructed.gather(2, among.flatten(2)).view(distance.shape)
+        ranges, lost = self.noise.sample(distance, link, "ranging", obstructed=obstructed)
         mask = window.reach[..., None, None].expand(ranges.shape)
         if self.latency:
             mask = mask & (window.steps >= self.latency)[..., None, None, None, None]
@@ -143,7 +148,8 @@ class AnchorRanging(Sensor):
         if self.blocked:
             blocked = torch.zeros(len(self.anchors), dtype=torch.bool, device=distance.device)
             blocked[list(self.blocked)] = True
-        ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked)
+        obstructed = self.noise.obstructed(window, index, "anchor_ranging")
+        ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked, obstructed)
         mask = window.alive[..., None, None].expand(ranges.shape)
         if self.radius is not None:
             mask = mask & (distance <= self.radius)

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from coloc_env import network as module
 from coloc_env import noise
-from coloc_env.network import Box, Network
+from coloc_env.motion import Box
+from coloc_env.network import Network
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 

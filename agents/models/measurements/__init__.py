@@ -6,13 +6,14 @@ from typing import Any
 from agents.models.measurements.base import Block, Measurement, Neighbours, heard, nobody
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
-from agents.models.measurements.vectors import Heights, LandmarkVectors, Slowness
-from coloc_env.scenario import Believed, ConstantVelocity, Wheeled
+from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
+from coloc_env.scenario import Believed, ConstantVelocity, InsDriven, Wheeled
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
     LandmarkBearings,
     Landmarks,
+    PositionFix,
     Ranging,
     Sensor,
     SlowFlight,
@@ -27,6 +28,7 @@ __all__ = [
     "LandmarkVectors",
     "Measurement",
     "Neighbours",
+    "PositionFixes",
     "Slowness",
     "UavRangeBearings",
     "UavRanges",
@@ -40,6 +42,7 @@ _MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     Height: Heights,
     LandmarkBearings: LandmarkRangeBearings,
     Landmarks: LandmarkVectors,
+    PositionFix: PositionFixes,
     Ranging: UavRanges,
     SlowFlight: Slowness,
     UavBearings: UavRangeBearings,
@@ -54,8 +57,9 @@ def make_measurements(believed: Believed) -> list[Measurement]:
     """
     for sensor in believed.sensors:
         name, process = type(sensor).__name__, believed.process
-        if isinstance(sensor, _BODY_FRAME) and isinstance(process, ConstantVelocity):
+        if isinstance(sensor, _BODY_FRAME) and isinstance(process, ConstantVelocity | InsDriven):
             raise ValueError(f"{name} are in the body frame: the motion model has no attitude")
-        if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled):
-            raise ValueError(f"{name} is about velocity, which is no state of wheeled motion")
+        if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled | InsDriven):
+            kind = type(process).__name__
+            raise ValueError(f"{name} is about velocity, which {kind} motion does not estimate")
     return [_MODELS[type(s)](s) for s in believed.sensors if type(s) in _MODELS]

@@ -1,4 +1,5 @@
-"""Measurements that are linear in position or velocity: landmark vectors, heights, slowness."""
+"""Measurements that are linear in position or velocity: landmark vectors, fixes, heights,
+slowness."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +9,7 @@ from agents.models.measurements.base import Block, Measurement, Neighbours
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
-from coloc_env.sensors import Height, Landmarks, SlowFlight
+from coloc_env.sensors import Height, Landmarks, PositionFix, SlowFlight
 
 
 class LandmarkVectors(Measurement):
@@ -50,6 +51,34 @@ class LandmarkVectors(Measurement):
             jacobian=jacobian,
             variance=x.new_tensor(self.std**2).expand_as(residual),
             mask=observation["landmark_mask"] > 0,
+        )
+
+
+class PositionFixes(Measurement):
+    """z = p + noise."""
+
+    mask_leaf = "position_fix_mask"
+
+    def __init__(self, sensor: PositionFix) -> None:
+        self.variance = sensor.std**2
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        d = process.dim
+        residual = observation["position_fix"].to(x.dtype).unsqueeze(-2) - x[..., None, :d]
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
+        jacobian[..., :d] = torch.eye(d, dtype=x.dtype, device=x.device)
+        return Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=x.new_tensor(self.variance).expand_as(residual),
+            mask=observation["position_fix_mask"] > 0,
         )
 
 
