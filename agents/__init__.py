@@ -1,12 +1,15 @@
 """Localizers and policies; importing this package registers every localizer."""
 
+from agents import dwmds as _dwmds  # noqa: F401
 from agents import ekf as _ekf  # noqa: F401
 from agents import ekf_joint as _ekf_joint  # noqa: F401
 from agents import emvf as _emvf  # noqa: F401
 from agents import hybrid as _hybrid  # noqa: F401
 from agents import learned_policy as _learned_policy  # noqa: F401
+from agents import mds as _mds  # noqa: F401
 from agents import pf as _pf  # noqa: F401
 from agents import pfnn as _pfnn  # noqa: F401
+from agents import team_map as _team_map  # noqa: F401
 from agents import trusting as _trusting  # noqa: F401
 from agents.localizer import LOCALIZERS, Estimate, Localizer, make, options_of, register
 

@@ -1,0 +1,58 @@
+"""Gauss–Newton on a whole team's ranges: the strong reference that keeps every correlation."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from agents.swarm.links import lengths
+
+Weigh = Callable[
+    [Float64[Tensor, "B N N"]], tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
+]
+_NOTHING = 1e-9  # m⁻²: information on a UAV that nothing ties to an anchor
+
+
+def fisher(
+    y: Float64[Tensor, "B N d"], weight: Float64[Tensor, "B N N"]
+) -> Float64[Tensor, "B N d N d"]:
+    """Σ_{i<j} W_ij J_ijᵀ J_ij of distances, J the unit vectors along links: a Laplacian of d × d
+    blocks."""
+    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / lengths(y).unsqueeze(-1)
+    block = (weight.unsqueeze(-1) * unit).unsqueeze(-1) * unit.unsqueeze(-2)
+    matrix = -block.movedim(-2, 2)  # [B, i, x, j, y]
+    matrix.diagonal(dim1=1, dim2=3).add_(block.sum(2).movedim(1, -1))
+    return matrix
+
+
+def gauss_newton(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weigh: Weigh,
+    fixed: Bool[Tensor, "B N"],
+    prior: Float64[Tensor, "B N d"],
+    precision: Float64[Tensor, "B N*d N*d"],
+    iterations: int,
+) -> tuple[Float64[Tensor, "B N d"], Float64[Tensor, "B N*d N*d"]]:
+    """Positions and their joint information, from ranges whose weights (1/m²) and shifts (m)
+    ``weigh(residual)`` gives at every iterate, and from a prior with a joint ``precision``. Who is
+    ``fixed`` stays (information 1 m⁻², tied to nobody)."""
+    n, d = y.shape[1:]
+    still = fixed.repeat_interleave(d, -1)
+    tied = still.unsqueeze(-1) | still.unsqueeze(-2)
+    matrix = precision
+    for _ in range(iterations):
+        length = lengths(y)
+        residual = distance - length
+        weight, shift = weigh(residual)
+        pull = weight * (residual - shift) / length
+        down = (pull.sum(-1, keepdim=True) * y - pull @ y).flatten(1)
+        down = down + (precision @ (prior - y).flatten(1).unsqueeze(-1))[..., 0]
+        matrix = fisher(y, weight).flatten(3).flatten(1, 2) + precision
+        matrix = matrix.masked_fill(tied, 0.0)
+        matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
+        factor = torch.linalg.cholesky_ex(matrix).L
+        delta = torch.cholesky_solve(down.masked_fill(still, 0.0).unsqueeze(-1), factor)
+        y = y + delta[..., 0].unflatten(-1, (n, d))
+    return y, matrix

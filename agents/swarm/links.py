@@ -1,0 +1,41 @@
+"""Ranges between the members of a team, as symmetric matrices."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from coloc_env.observation import Observation
+
+
+@dataclass(frozen=True)
+class Links:
+    """``distance`` [B, N, N] in m (0 where there is none), ``mask`` which were measured."""
+
+    distance: Float64[Tensor, "B N N"]
+    mask: Bool[Tensor, "B N N"]
+
+
+def links_of(observation: Observation) -> Links:
+    """The links that both ends report, from the leaves ``ranges`` and ``range_mask`` (single tags)
+    and, in teams with more UAVs than slots, ``neighbours``."""
+    ranges, mask = observation["ranges"].double(), observation["range_mask"] > 0
+    n = ranges.shape[-2]
+    if "neighbours" in observation:
+        index = observation["neighbours"].to(torch.int64)
+        there = torch.zeros(*mask.shape[:-1], n, dtype=torch.bool, device=mask.device)
+        wide = ranges.new_zeros(*mask.shape[:-1], n)
+        # An empty slot names UAV 0: what it would write is written where it changes nothing.
+        index = torch.where(mask, index, torch.arange(n, device=mask.device).unsqueeze(-1))
+        ranges = wide.scatter(-1, index, ranges * mask)
+        mask = there.scatter(-1, index, mask)
+    either = mask | mask.mT
+    both = torch.where(mask, ranges, ranges.mT)
+    return Links(torch.where(either, both, 0.0), either)
+
+
+def lengths(position: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N N"]:
+    """Distances between all members (m, 1e-9 at least)."""
+    apart = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
+    return apart.clamp_min(1e-9)

@@ -1,0 +1,65 @@
+"""Stress and its majorization (Guttman transform) with anchors and a prior.
+
+S(y) = Σ_{i<j} W_ij (d_ij − ‖y_i − y_j‖)² + Σ_i λ_i ‖y_i − m_i‖² (ST-DCL, equation 19, its window
+folded into the prior m). de Leeuw 1977; Costa, Patwari & Hero, ACM TOSN 2006.
+"""
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from agents.swarm.links import lengths
+
+
+def stress(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B N N"],
+    prior: Float64[Tensor, "B N d"],
+    trust: Float64[Tensor, "B N"],
+) -> Float64[Tensor, "B"]:
+    """S(y) in units of ``weight`` · m²; ``trust`` is λ."""
+    links = 0.5 * (weight * (distance - lengths(y)) ** 2).sum((-2, -1))
+    return links + (trust * (y - prior).square().sum(-1)).sum(-1)
+
+
+def descent(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B N N"],
+    prior: Float64[Tensor, "B N d"],
+    trust: Float64[Tensor, "B N"],
+) -> Float64[Tensor, "B N d"]:
+    """−½ ∂S/∂y."""
+    pull = weight * (distance / lengths(y) - 1.0)
+    return pull.sum(-1, keepdim=True) * y - pull @ y + trust.unsqueeze(-1) * (prior - y)
+
+
+def majorizer(
+    weight: Float64[Tensor, "B N N"],
+    trust: Float64[Tensor, "B N"],
+    fixed: Bool[Tensor, "B N"],
+) -> Float64[Tensor, "B N N"]:
+    """Cholesky factor of V, the weighted Laplacian of those that move plus λ (the identity where
+    ``fixed``). Who has neither links nor prior stays where it is."""
+    moving = ~fixed
+    degree = weight.sum(-1) + trust
+    v = -weight * (moving.unsqueeze(-1) & moving.unsqueeze(-2))
+    alone = degree <= 0
+    v.diagonal(dim1=-2, dim2=-1).copy_(torch.where(fixed | alone, 1.0, degree))
+    return torch.linalg.cholesky_ex(v).L
+
+
+def guttman(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B N N"],
+    prior: Float64[Tensor, "B N d"],
+    trust: Float64[Tensor, "B N"],
+    fixed: Bool[Tensor, "B N"],
+    factor: Float64[Tensor, "B N N"],
+) -> Float64[Tensor, "B N d"]:
+    """One step y ← y + V⁻¹ (−½ ∂S/∂y), which never raises the stress; anchors stay."""
+    down = descent(y, distance, weight, prior, trust)
+    down = torch.where(fixed.unsqueeze(-1), 0.0, down)
+    return y + torch.cholesky_solve(down, factor)

@@ -1,0 +1,88 @@
+"""References for swarms that keep all correlations of a team: the snapshot's and the recursive one.
+
+Gauss–Newton over the joint position of all UAVs, without a prior (``gn``) and with the joint
+covariance that dead reckoning has carried on (``map``).
+"""
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from agents.localizer import register
+from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
+from agents.swarm.gauss_newton import gauss_newton
+from coloc_env.scenario import Believed
+
+
+class _Joint(SwarmFilter):
+    """Gauss–Newton with ``iterations`` a step."""
+
+    centralized = True
+
+    def __init__(self, believed: Believed, confidence: Confidence, iterations: int) -> None:
+        super().__init__(believed, confidence)
+        if iterations < 1:
+            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
+        self.iterations = iterations
+
+    def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N d K"]:
+        b, n = variance.shape
+        d = self.process.dim
+        whole = torch.diag_embed(variance.repeat_interleave(d, -1))
+        return whole.view(b, n, d, n * d)
+
+    def solved(self, now: Prepared, precision: Float64[Tensor, "B K K"]) -> Found:
+        """Positions, and the inverse of their joint information."""
+        position, information = gauss_newton(
+            now.place,
+            now.links.distance,
+            lambda residual: self.weigh_residual(residual, now),
+            now.fixed,
+            now.place,
+            precision,
+            self.iterations,
+        )
+        joint = torch.cholesky_inverse(torch.linalg.cholesky_ex(information).L)
+        still = now.fixed.repeat_interleave(self.process.dim, -1)
+        known = torch.diag_embed(now.variance.repeat_interleave(self.process.dim, -1))
+        joint = torch.where(still.unsqueeze(-1) | still.unsqueeze(-2), known, joint)
+        joint = joint.unflatten(1, now.place.shape[1:])
+        variance = own_blocks(joint).diagonal(dim1=-2, dim2=-1).mean(-1)
+        return Found(position, variance, joint)
+
+
+@register("gn")
+class Snapshot(_Joint):
+    """Gauss–Newton on the ranges of one step, started where dead reckoning is. ``confidence``:
+    ``huber``, ``em`` or ``none``, as ``dwmds_st`` has it."""
+
+    name = "gn"
+
+    def __init__(
+        self, believed: Believed, *, confidence: Confidence = "huber", iterations: int = 6
+    ) -> None:
+        super().__init__(believed, confidence, iterations)
+
+    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
+        return self.solved(now, torch.zeros_like(belief.joint.flatten(1, 2)))
+
+
+@register("map")
+class RecursiveMap(_Joint):
+    """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
+    ``huber`` or ``none``, as ``dwmds_st`` has it."""
+
+    name = "map"
+
+    def __init__(
+        self, believed: Believed, *, confidence: Confidence = "em", iterations: int = 3
+    ) -> None:
+        super().__init__(believed, confidence, iterations)
+
+    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
+        covariance = belief.joint.flatten(1, 2).clone()
+        covariance.diagonal(dim1=-2, dim2=-1).add_(
+            now.added.repeat_interleave(self.process.dim, -1)
+        )
+        factor = torch.linalg.cholesky_ex(covariance).L
+        return self.solved(now, torch.cholesky_inverse(factor))

@@ -1,0 +1,262 @@
+"""Scaling, majorization, calibration and Gauss–Newton on whole teams, against others' results."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import orthogonal_procrustes
+from scipy.optimize import least_squares, minimize
+from scipy.sparse.csgraph import floyd_warshall
+from torch import Tensor
+
+from agents.swarm import calibration, weights
+from agents.swarm.gauss_newton import fisher, gauss_newton
+from agents.swarm.links import lengths, links_of
+from agents.swarm.majorization import descent, guttman, majorizer, stress
+from agents.swarm.scaling import aligned, classical_scaling, shortest_paths
+from coloc_env.observation import Observation
+
+STD = 10.0
+
+
+def team(seed: int, n: int = 12, worlds: int = 2, reach: float = 700.0) -> dict[str, Tensor]:
+    """Random places, noisy ranges within reach, a prior, and four who are fixed."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    place = 1000 * torch.rand(worlds, n, 3, generator=generator, dtype=torch.float64)
+    true = lengths(place)
+    mask = true < reach
+    mask.diagonal(dim1=-2, dim2=-1).fill_(False)
+    noise = torch.triu(normal(worlds, n, n), 1)
+    distance = (true + STD * (noise + noise.mT)) * mask
+    fixed = torch.zeros(worlds, n, dtype=torch.bool)
+    fixed[:, :4] = True
+    prior = torch.where(fixed.unsqueeze(-1), place, place + 30 * normal(worlds, n, 3))
+    trust = torch.where(fixed, 0.0, torch.full((worlds, n), 1 / 900.0, dtype=torch.float64))
+    return {
+        "place": place,
+        "distance": distance,
+        "mask": mask,
+        "weight": mask.double() / STD**2,
+        "fixed": fixed,
+        "prior": prior,
+        "trust": trust,
+    }
+
+
+# ---------------------------------------------------------------- links and scaling
+
+
+def test_either_ends_report_makes_a_link() -> None:
+    ranges = torch.tensor([[[0.0, 5.0, 7.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    links = links_of(Observation({"ranges": ranges, "range_mask": (ranges > 0).float()}))
+    expected = [[0.0, 5.0, 7.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]]
+    assert links.distance[0].tolist() == expected
+    assert torch.equal(links.mask, links.distance > 0)
+
+
+def test_links_from_neighbour_slots() -> None:
+    ranges = torch.tensor([[[7.0, 0.0], [0.0, 0.0], [7.0, 0.0]]])
+    slots = torch.tensor([[[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]]])
+    leaves = {"ranges": ranges, "range_mask": (ranges > 0).float(), "neighbours": slots}
+    links = links_of(Observation(leaves))
+    assert links.distance[0].tolist() == [[0.0, 0.0, 7.0], [0.0, 0.0, 0.0], [7.0, 0.0, 0.0]]
+    assert links.mask.sum() == 2
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=10, deadline=None)
+def test_classical_scaling_restores_exact_distances(seed: int) -> None:
+    place = team(seed)["place"]
+    true = lengths(place)
+    assert torch.allclose(lengths(classical_scaling(true, 3)), true, atol=1e-6)
+
+
+def test_classical_scaling_is_torgersons_eigendecomposition() -> None:
+    paths = shortest_paths(team(1)["distance"], team(1)["mask"])[0].numpy()
+    centring = np.eye(12) - 1 / 12
+    values, vectors = np.linalg.eigh(-0.5 * centring @ paths**2 @ centring)
+    best = np.argsort(values)[::-1][:3]
+    expected = vectors[:, best] * np.sqrt(values[best])
+    found = classical_scaling(torch.from_numpy(paths)[None], 3)[0].numpy()
+    np.testing.assert_allclose(np.abs(found), np.abs(expected), atol=1e-8)
+
+
+def test_shortest_paths_are_scipys() -> None:
+    world = team(2, reach=450.0)
+    found = shortest_paths(world["distance"], world["mask"])
+    for one, distance in zip(found, world["distance"], strict=True):
+        np.testing.assert_allclose(one, floyd_warshall(distance.numpy(), directed=False))
+
+
+@given(st.integers(0, 1000), st.floats(0.2, 5.0))
+@settings(max_examples=10, deadline=None)
+def test_alignment_undoes_any_similarity(seed: int, scale: float) -> None:
+    place = team(seed)["place"]
+    generator = torch.Generator().manual_seed(seed)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    weight = torch.zeros(2, 12, dtype=torch.float64)
+    weight[:, :5] = 1.0
+    assert torch.allclose(aligned(scale * place @ turn + 7.0, place, weight), place, atol=1e-6)
+
+
+def test_alignment_turns_as_scipy_does() -> None:
+    world = team(3)
+    a, b = (x[0] - x[0].mean(0) for x in (world["prior"], world["place"]))
+    turn, scale = orthogonal_procrustes(a.numpy(), b.numpy())
+    expected = scale / (a.numpy() ** 2).sum() * a.numpy() @ turn
+    found = aligned(a[None], b[None], torch.ones(1, 12, dtype=torch.float64))[0]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+# ---------------------------------------------------------------- majorization
+
+
+def parts(world: dict[str, Tensor]) -> tuple[Tensor, ...]:
+    return tuple(world[name] for name in ("distance", "weight", "prior", "trust"))
+
+
+@given(st.integers(0, 1000), st.floats(300.0, 1800.0))
+@settings(max_examples=15, deadline=None)
+def test_majorization_never_raises_the_stress(seed: int, reach: float) -> None:
+    world = team(seed, reach=reach)
+    y, fixed = world["prior"] + 100.0 * ~world["fixed"].unsqueeze(-1), world["fixed"]
+    factor = majorizer(world["weight"], world["trust"], fixed)
+    before = stress(y, *parts(world))
+    for _ in range(20):
+        y = guttman(y, *parts(world), fixed, factor)
+        after = stress(y, *parts(world))
+        assert (after <= before * (1 + 1e-12)).all()
+        before = after
+    assert torch.equal(y[fixed], world["place"][fixed])
+
+
+def test_descent_is_half_the_stresss_gradient() -> None:
+    world = team(4)
+    y = world["prior"].clone().requires_grad_(True)
+    stress(y, *parts(world)).sum().backward()
+    found = descent(y.detach(), *parts(world))
+    assert y.grad is not None
+    assert torch.allclose(found, -0.5 * y.grad, rtol=1e-9, atol=1e-9)
+
+
+def test_majorization_ends_in_the_minimum_that_scipy_finds() -> None:
+    world = {name: x[:1] for name, x in team(5).items()}
+    y, fixed = world["prior"], world["fixed"]
+    factor = majorizer(world["weight"], world["trust"], fixed)
+    for _ in range(3000):
+        y = guttman(y, *parts(world), fixed, factor)
+    free = ~fixed[0]
+
+    def cost(flat: np.ndarray) -> float:
+        trial = world["place"].clone()
+        trial[0, free] = torch.from_numpy(flat).view(-1, 3)
+        return float(stress(trial, *parts(world)))
+
+    best = minimize(cost, world["prior"][0, free].numpy().ravel(), options={"gtol": 1e-8})
+    assert float(stress(y, *parts(world))) == pytest.approx(best.fun, rel=1e-6)
+    np.testing.assert_allclose(y[0, free].ravel(), best.x, atol=1e-2)
+
+
+def test_who_has_no_link_stays_with_its_prior() -> None:
+    world = team(6)
+    world["weight"][:, 7] = world["weight"][:, :, 7] = 0.0
+    factor = majorizer(world["weight"], world["trust"], world["fixed"])
+    y = world["prior"] + 5.0
+    for _ in range(3):
+        y = guttman(y, *parts(world), world["fixed"], factor)
+    assert torch.allclose(y[:, 7], world["prior"][:, 7])
+
+
+# ---------------------------------------------------------------- what errors look like
+
+
+@pytest.mark.parametrize(("share", "bias", "spread"), [(0.15, 25.0, 10.0), (0.5, 0.0, 50.0)])
+def test_calibration_finds_the_mixture(share: float, bias: float, spread: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model = calibration.believed_model(1, STD, torch.device("cpu"))
+    for _ in range(60):
+        outlier = torch.rand(1, 400, generator=generator) < share
+        normal = torch.randn(1, 400, generator=generator, dtype=torch.float64)
+        error = torch.where(outlier, bias + spread * normal, STD * normal)
+        model = calibration.learned(model, error, torch.ones_like(outlier), STD)
+    mean, variance = model.component(STD)
+    assert float(model.share[0, 1]) == pytest.approx(share, abs=0.04)
+    assert float(mean[0, 1]) == pytest.approx(bias, abs=3.0)
+    assert variance[0].sqrt().tolist() == pytest.approx([STD, spread], rel=0.15)
+
+
+def test_nothing_is_learned_from_links_that_were_not_measured() -> None:
+    model = calibration.believed_model(1, STD, torch.device("cpu"))
+    wild = torch.full((1, 50), 500.0, dtype=torch.float64)
+    after = calibration.learned(model, wild, torch.zeros(1, 50, dtype=torch.bool), STD)
+    assert torch.allclose(after.share, model.share)
+
+
+def test_a_link_with_an_outliers_residual_is_shifted_back_and_counts_less() -> None:
+    model = calibration.ErrorModel(
+        sums=torch.tensor([[[85.0, 0.0, 8500.0], [15.0, 375.0, 15 * (625 + 100.0)]]]).double(),
+        batch_size=(1,),
+    )
+    residual = torch.tensor([[[0.0, 25.0], [12.5, 60.0]]], dtype=torch.float64)
+    weight, shift = calibration.judged(model, residual, torch.zeros_like(residual), STD)
+    assert 0.0 < float(shift[0, 0, 0]) < 3.0 < 20.0 < float(shift[0, 0, 1]) < 25.0
+    assert torch.allclose(weight, torch.full_like(weight, 1 / STD**2))  # both as wide
+    assert (shift.diff(dim=-1) > 0).all()
+
+
+def test_huber_weights_are_scipys() -> None:
+    residual = torch.tensor([[[1.0, 13.45], [-26.9, 0.0]]], dtype=torch.float64)
+    mask, zero = torch.ones(1, 2, 2, dtype=torch.bool), torch.zeros(1, 2, 2).double()
+    weight, _ = weights.huber(residual, mask, zero, STD)
+    assert (weight * STD**2)[0].tolist() == [[1.0, 1.0], [pytest.approx(0.5), 1.0]]
+
+
+# ---------------------------------------------------------------- Gauss–Newton
+
+
+def test_gauss_newton_is_scipys_least_squares() -> None:
+    world = {name: x[:1] for name, x in team(7).items()}
+    fixed, free = world["fixed"], ~world["fixed"][0]
+    precision = torch.diag_embed(world["trust"].repeat_interleave(3, -1))
+    found, information = gauss_newton(
+        world["prior"],
+        world["distance"],
+        lambda residual: weights.plain(residual, world["mask"], STD),
+        fixed,
+        world["prior"],
+        precision,
+        20,
+    )
+    pairs = torch.triu(world["mask"][0], 1).nonzero().numpy()
+
+    def residuals(flat: np.ndarray) -> np.ndarray:
+        trial = world["place"][0].numpy().copy()
+        trial[free] = flat.reshape(-1, 3)
+        apart = np.linalg.norm(trial[pairs[:, 0]] - trial[pairs[:, 1]], axis=1)
+        links = (world["distance"][0].numpy()[tuple(pairs.T)] - apart) / STD
+        prior = (trial[free] - world["prior"][0, free].numpy()) / 30.0
+        return np.concatenate((links, prior.ravel()))
+
+    best = least_squares(residuals, world["prior"][0, free].numpy().ravel(), xtol=1e-14)
+    np.testing.assert_allclose(found[0, free].ravel(), best.x, atol=1e-4)
+    kept = free.repeat_interleave(3)
+    np.testing.assert_allclose(information[0][kept][:, kept], best.jac.T @ best.jac, rtol=1e-3,
+                               atol=1e-5)  # fmt: skip
+
+
+def test_fisher_information_is_that_of_automatic_differentiation() -> None:
+    world = {name: x[:1] for name, x in team(8, n=6).items()}
+    pairs = torch.triu(world["mask"][0], 1).nonzero().T
+
+    def measured(flat: Tensor) -> Tensor:
+        place = flat.view(6, 3)
+        return (place[pairs[0]] - place[pairs[1]]).norm(dim=-1) / STD
+
+    jacobian = torch.func.jacrev(measured)(world["place"].flatten())
+    found = fisher(world["place"], world["weight"])[0].flatten(2).flatten(0, 1)
+    assert torch.allclose(found, jacobian.mT @ jacobian, atol=1e-12)
