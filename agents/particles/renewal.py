@@ -161,7 +161,7 @@ def _per_error(process: Process, std: dict[str, float]) -> list[float]:
     """A standard deviation for each component of the process's error."""
     d, turn = process.dim, process.attitude_error
     if turn is None:
-        return [std["position"]] * d + [std["velocity"]] * d
+        return ([std["position"]] * d + [std["velocity"]] * d)[: process.error_size]
     linear = [std["position"]] * d + [std["velocity"]] * (turn.start - d)
     biases = [std["accel"]] * 3 + [std["gyro"]] * 3
     return (linear + [std["attitude"]] * (turn.stop - turn.start) + biases)[: process.error_size]

@@ -77,6 +77,7 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "plane": plane,
     "tags": tags,
     "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, dropout=0.2),
+    "swarm": lambda: make_scenario("swarm-v0", n_uavs=8, anchors=0.4, nlos_time=3.0),
 }
 ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
@@ -99,11 +100,12 @@ CHOSEN = {
     "hpff": ("anchors", "tags", "wsn"),
     "nnhpff": ("anchors", "tags", "wsn"),
 }
-ELSEWHERE = [f for f in FAMILIES if f != "wsn"]
+ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm")]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE) if n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
     *((n, "wsn") for n in ("pf", "ekf")),
+    *((n, "swarm") for n in ("dead_reckoning", "ekf", "ekf_joint", "pf", "ekf:robust=huber")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]

@@ -1,11 +1,14 @@
 """The Kalman filters in the room: as good as the bound, as sure as they may be, robust if told."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from filterpy.kalman import KalmanFilter
 
 from agents import make
 from coloc_env.bounds import posterior_bound
@@ -22,6 +25,55 @@ def bound() -> float:
 
 
 # ---------------------------------------------------------------- as good as can be
+
+
+def test_with_fixes_alone_it_is_the_textbook_filter() -> None:
+    """In a swarm that measures nothing between its UAVs all is linear: filterpy's Kalman filter,
+    one for each UAV, with or without fixes."""
+    scenario = make_scenario("swarm-v0", n_uavs=4, anchors=0.5, anchor_std=8.0)
+    own = scenario.sensors[:2]
+    scenario = replace(scenario, sensors=own, believed_sensors=own)
+    localizer, world = make("ekf", scenario), World(scenario)
+    seen = world.reset(0)
+    belief, filters = localizer.reset(seen), []
+    for told in seen["prior"][0].double().numpy():
+        textbook = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+        textbook.x, textbook.P = told[:3, None], 50.0**2 * np.eye(3)
+        textbook.F = textbook.B = textbook.H = np.eye(3)
+        textbook.Q, textbook.R = (0.5**2 + 2 * 0.3**2) * np.eye(3), 8.0**2 * np.eye(3)
+        filters.append(textbook)
+    for k in range(30):
+        belief, estimate = localizer.step(belief, seen)
+        for i, textbook in enumerate(filters):
+            if k:
+                textbook.predict(u=seen["ins"][0, i].double().numpy()[:, None])
+            if i < 2:
+                textbook.update(seen["position_fix"][0, i].double().numpy()[:, None])
+            assert estimate.position[0, i].numpy() == pytest.approx(textbook.x[:, 0], rel=1e-9)
+            assert estimate.covariance[0, i].numpy() == pytest.approx(textbook.P, abs=1e-7)
+        world.advance(estimate.action())
+        seen = world.observation()
+
+
+def test_the_swarm_is_localized(tools: SimpleNamespace) -> None:
+    """Between dead reckoning and the bound, all but the guides, who know."""
+    scenario = make_scenario("swarm-v0", n_uavs=60, nlos=0.0)
+    least = posterior_bound(scenario, 2, steps=40).rmse
+    rmse = {}
+    for name in ("dead_reckoning", "ekf"):
+        localizer, world = make(name, scenario), World(scenario, 2)
+        seen, squared = world.reset(0), []
+        belief = localizer.reset(seen)
+        for _ in range(40):
+            belief, estimate = localizer.step(belief, seen)
+            error, scored = world.score(estimate.action())
+            squared.append(error[scored].square())
+            guided = (estimate.position - world.truth.position)[:, :9]
+            assert name == "dead_reckoning" or guided.norm(dim=-1).max() < 1.0
+            world.advance(estimate.action())
+            seen = world.observation()
+        rmse[name] = float(torch.cat(squared).mean().sqrt())
+    assert least < rmse["ekf"] < 0.25 * rmse["dead_reckoning"]
 
 
 @pytest.mark.parametrize("name", ["ekf", "ekf_joint"])

@@ -9,17 +9,21 @@ from torch import Tensor
 
 from agents.models.measurements import Block, Measurement, Neighbours, heard, make_measurements
 from agents.models.process import Process, make_process
+from coloc_env import scenario as settings
 from coloc_env.motion import Aggressive, Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Scenario, Wheeled
+from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
+from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
     Imu,
+    Ins,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    PositionFix,
     RangeNoise,
     Ranging,
     Sensor,
@@ -54,6 +58,10 @@ KINDS: dict[str, tuple[str, Sensor]] = {
     "uav bearings": ("wheeled", UavBearings(1e-6, 1e-6, 0.7, depth=2)),
     "height": ("velocity", Height(1e-6, dropout=0.2)),
     "slow flight": ("velocity", SlowFlight(0.5)),
+    "fixes": ("inertial", PositionFix(1e-6, count=2)),
+    "fixes, ins": ("ins", PositionFix(1e-6, count=2)),
+    "fixes, plane": ("wheeled", PositionFix(1e-6, count=2)),
+    "ranges, ins": ("ins", Ranging(EXACT)),
 }
 
 
@@ -78,8 +86,17 @@ class Setting:
 def setting(request: pytest.FixtureRequest) -> Setting:
     kind, sensor = KINDS[request.param]
     dim = 2 if kind == "wheeled" else 3
-    driver: dict[str, tuple[Sensor, ...]] = {"wheeled": (Odometry(),), "velocity": ()}
-    moved = {"wheeled": Wheeled(), "velocity": ConstantVelocity(), "biased": Inertial(0.1, 0.01)}
+    driver: dict[str, tuple[Sensor, ...]] = {
+        "wheeled": (Odometry(),),
+        "velocity": (),
+        "ins": (Ins(),),
+    }
+    moved = {
+        "wheeled": Wheeled(),
+        "velocity": ConstantVelocity(),
+        "biased": Inertial(0.1, 0.01),
+        "ins": InsDriven(),
+    }
     sensors = (*driver.get(kind, (Imu(),)), sensor)
     scenario = Scenario(
         name="models",
@@ -249,3 +266,20 @@ def test_messages_are_moved_to_now() -> None:
         near.variance[0, 0, 0], torch.tensor([-2.0, -4.0]).double().exp(), rtol=1e-6, atol=0
     )
     assert near.known.tolist() == [[[True, False]]]
+
+
+@pytest.mark.parametrize(
+    ("process", "sensor", "words"),
+    [
+        (InsDriven(), Landmarks(3), "Landmarks are in the body frame: the motion model has no att"),
+        (ConstantVelocity(), UavBearings(), "UavBearings are in the body frame"),
+        (InsDriven(), SlowFlight(0.5), "SlowFlight is about velocity, which InsDriven motion does"),
+        (Wheeled(), SlowFlight(0.5), "SlowFlight is about velocity, which Wheeled motion does not"),
+    ],
+)
+def test_sensors_of_what_is_no_state_are_refused(
+    process: settings.Process, sensor: Sensor, words: str
+) -> None:
+    believed = make_scenario("swarm-v0", n_uavs=3).believed
+    with pytest.raises(ValueError, match=words):
+        make_measurements(replace(believed, process=process, sensors=(sensor,)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from agents.models.process import (
     ConstantVelocityProcess,
     InertialProcess,
+    InsProcess,
     Process,
     WheeledProcess,
     make_process,
@@ -20,9 +22,9 @@ from agents.models.process import (
 from coloc_env.bounds.process import error_model
 from coloc_env.motion import Aggressive, Arena, Kinematics, RandomVelocity
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Scenario, Wheeled
+from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
-from coloc_env.sensors import GRAVITY, Imu, Odometry, Sensor
+from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
 from coloc_env.world import World
 
 DT = 0.1
@@ -33,6 +35,8 @@ PROCESSES: dict[str, Callable[[], Process]] = {
     "biased": lambda: InertialProcess(DT, IMU, Inertial(0.1, 0.01)),
     "walking": lambda: InertialProcess(DT, IMU, WALKING),
     "wheeled": lambda: WheeledProcess(DT, ODOMETRY),
+    "ins": lambda: InsProcess(3, DT, Ins(0.3, 0.2), InsDriven(1.5)),
+    "ins, plane": lambda: InsProcess(2, DT, Ins(0.3), InsDriven()),
     "velocity": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7)),
     "plane": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7)),
     "damped": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7, damping=0.4)),
@@ -64,6 +68,8 @@ def states(process: Process, count: int = 50, seed: int = 0) -> Tensor:
 def inputs(process: Process, count: int = 50, seed: int = 1) -> Tensor:
     """[1, count, U]: hard manoeuvres, with gravity where it is felt."""
     width = {4: 6, 1: 3, 0: 0}[process.attitude_size]
+    if isinstance(process, InsProcess):
+        width = process.dim
     u = normal(1, count, width, seed=seed)
     if width == 6:
         u[..., 2] += GRAVITY
@@ -259,13 +265,45 @@ def test_velocities_that_make_no_sense_are_refused(wrong: dict, words: str) -> N
         ConstantVelocity(**wrong)
 
 
+def test_the_ins_counts_a_share_of_its_bias_as_noise() -> None:
+    process = InsProcess(3, 0.5, Ins(0.4, 0.3), InsDriven(2.5))
+    x = states(process, 3)
+    u = inputs(process, 3)
+    f, q = process.linearize(x, u, seconds(x, 0.5))
+    torch.testing.assert_close(f, torch.eye(3).double().expand_as(f))
+    variance = 0.25 * (0.16 + 2.5 * 0.09)
+    torch.testing.assert_close(q, variance * torch.eye(3).double().expand_as(q))
+    moved = process.propagate(x, u, seconds(x, 0.5))
+    torch.testing.assert_close(moved, torch.cat((x[..., :3] + 0.5 * u, u), -1))
+    with pytest.raises(ValueError, match=r"InsDriven: bias_share=-1\.0 is not allowed"):
+        InsDriven(-1.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "dim", "words"),
+    [
+        (Inertial(), 3, "inertial, but the team has no IMU"),
+        (InsDriven(), 3, "driven by an INS, but the team has none"),
+        (Wheeled(), 2, "wheeled, but the team has no odometry"),
+    ],
+)
+def test_a_motion_without_its_sensor_is_refused(model: Any, dim: int, words: str) -> None:
+    believed = make_scenario("wsn-v0" if dim == 2 else "indoor-v0").believed
+    with pytest.raises(ValueError, match=words):
+        make_process(replace(believed, process=model, sensors=()))
+
+
 # ---------------------------------------------------------------- against the world
 
 
-@pytest.mark.parametrize("kind", ["inertial", "wheeled"])
+@pytest.mark.parametrize("kind", ["inertial", "wheeled", "ins"])
 def test_without_noise_the_model_follows_the_world(kind: str) -> None:
-    sensor: Sensor = Imu(0.0, 0.0) if kind == "inertial" else Odometry(0.0, 0.0, 0.0)
-    dim = 3 if kind == "inertial" else 2
+    exact: dict[str, tuple[int, Sensor, Any]] = {
+        "inertial": (3, Imu(0.0, 0.0), Inertial()),
+        "wheeled": (2, Odometry(0.0, 0.0, 0.0), Wheeled()),
+        "ins": (3, Ins(0.0), InsDriven()),
+    }
+    dim, sensor, model = exact[kind]
     scenario = Scenario(
         name="exact",
         arena=Arena(dim, 4, DT, (0.0,) * dim, (20.0, 16.0, 8.0)[:dim]),
@@ -274,24 +312,27 @@ def test_without_noise_the_model_follows_the_world(kind: str) -> None:
         sensors=(sensor,),
         network=Network(),
         prior=Prior(0.0, 0.0, 0.0),
-        process=Inertial() if dim == 3 else Wheeled(),
+        process=model,
         believed_sensors=(sensor,),
     )
     process, world = make_process(scenario.believed), World(scenario, 2)
     x, _ = process.initial(world.reset(0)["prior"].double())
+    size = process.state_size
     idle = torch.zeros(2, 4, 3 * dim)
     truth = world.truth
     for _ in range(40):
-        start = torch.cat((truth.position, truth.velocity, truth.attitude), -1)
+        start = torch.cat((truth.position, truth.velocity, truth.attitude), -1)[..., :size]
         world.advance(idle)
         truth = world.truth
         u = process.inputs(world.observation())
         moved = process.propagate(start, u, seconds(start))
-        now = torch.cat((truth.position, truth.velocity, truth.attitude), -1)
+        now = torch.cat((truth.position, truth.velocity, truth.attitude), -1)[..., :size]
         error = process.boxminus(moved, now).abs()
-        place = 2e-3 if dim == 3 else 3e-5  # the mean force of a step leaves jerk · dt³ / 12
+        place = (
+            2e-3 if kind == "inertial" else 3e-5
+        )  # the mean force of a step leaves jerk · dt³ / 12
         assert error[..., :dim].max() < place
-        assert error[..., dim:].max() < 3e-5  # float32 leaves
+        assert kind == "ins" or error[..., dim:].max() < 3e-5  # float32 leaves
     assert x.shape == now.shape
 
 
@@ -315,4 +356,9 @@ def test_initial_error_is_what_the_prior_says() -> None:
     assert x[0, 0].tolist() == flat[0, 0, :5].tolist()
     torch.testing.assert_close(
         covariance[0, 0].diagonal().sqrt(), torch.tensor([0.7, 0.8, 0.05]).double()
+    )
+    x, covariance = PROCESSES["ins"]().initial(prior)
+    assert x[0, 0].tolist() == prior[0, 0, :6].tolist()
+    torch.testing.assert_close(
+        covariance[0, 0].diagonal().sqrt(), torch.tensor([0.7, 0.8, 0.9]).double()
     )

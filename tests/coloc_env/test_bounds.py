@@ -30,16 +30,26 @@ from coloc_env.geometry import (
 from coloc_env.motion import Aggressive, Arena, Carry, Kinematics, Motion, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Process, Scenario, Wheeled
+from coloc_env.scenario import (
+    ConstantVelocity,
+    Inertial,
+    InsDriven,
+    Prior,
+    Process,
+    Scenario,
+    Wheeled,
+)
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     GRAVITY,
     AnchorRanging,
     Height,
     Imu,
+    Ins,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    PositionFix,
     RangeNoise,
     Ranging,
     Recorded,
@@ -254,6 +264,11 @@ def predicted_height(s: Height, p: Kinematics, seen: Observation) -> tuple[Tenso
     return p.position[0, :, 2:], seen["height_mask"][0].double() / s.std**2
 
 
+def predicted_fix(s: PositionFix, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
+    mask = seen["position_fix_mask"][0].double()
+    return p.position[0], (mask / s.std**2).expand_as(p.position[0])
+
+
 def tag_places(p: Kinematics, tags: tuple) -> Tensor:
     if not tags:
         return p.position[0].unsqueeze(1)
@@ -309,6 +324,8 @@ CASES: list[tuple[Sensor, int, Callable]] = [
     (Landmarks(6, std=0.2, radius=6.0, dropout=0.3), 3, predicted_landmarks),
     (Landmarks(6, std=0.2, radius=6.0), 2, predicted_landmarks),
     (Height(0.1, dropout=0.3), 3, predicted_height),
+    (PositionFix(0.3, count=2), 3, predicted_fix),
+    (PositionFix(0.3, count=1), 2, predicted_fix),
     (AnchorRanging(ANCHORS, RangeNoise(0.3, dropout=0.3), TAGS), 3, predicted_anchors),
     (AnchorRanging(PLANE_ANCHORS, RangeNoise(0.3), PLANE_TAGS, radius=7.0), 2, predicted_anchors),
     (AnchorRanging(ANCHORS), 3, predicted_anchors),
@@ -512,6 +529,38 @@ def test_biases_are_states_where_the_truth_has_them() -> None:
     assert same.rmse == pytest.approx(plain.rmse, rel=0.02)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("ins", [Ins(0.5), Ins(0.5, 0.3, 4.0), Ins(0.0, 0.3, 60.0)])
+def test_an_ins_alone_errs_as_its_noise_adds_up(ins: Ins, dim: int) -> None:
+    """Variance of the sum of white noise and of a Gauss–Markov process, sample by sample."""
+    task = scenario(ins, dim=dim, process=InsDriven(), prior=Prior(2.0))
+    k = np.arange(1, 51)
+    bias = ins.bias**2 * np.exp(-0.1 * np.abs(k[:, None] - k) / ins.bias_time)
+    variance = 2.0**2 + 0.1**2 * (50 * ins.std**2 + bias.sum())
+    bound = posterior_bound(task, 1, steps=51)
+    assert bound.position[-1].numpy() == pytest.approx(np.sqrt(dim * variance))
+
+
+def test_an_ins_with_fixes_is_bounded_by_the_kalman_filter_that_knows_its_bias() -> None:
+    ins, fix = Ins(0.5, 0.3, 4.0), PositionFix(0.8, count=2)
+    task = scenario(ins, fix, process=InsDriven(), prior=Prior(2.0))
+    kept = np.exp(-0.1 / 4.0)
+    f = np.array([[1.0, 0.1 * kept], [0.0, kept]])  # p₊ − p̂₊ where p̂ adds up what the INS says
+    push, white = np.array([0.1, 1.0]), np.diag([(0.1 * 0.5) ** 2, 0.0])
+    q = 0.09 * (1 - kept**2) * np.outer(push, push) + white
+    covariance, expected = np.diag([4.0, 0.09]), []
+    for step in range(40):
+        if step:
+            covariance = f @ covariance @ f.T + q
+        gain = covariance[:, :1] / (covariance[0, 0] + 0.64)
+        covariance = covariance - gain @ covariance[:1]
+        expected.append(np.sqrt(3 * covariance[0, 0]))
+    found = posterior_bound(task, 1, steps=40).position.numpy()
+    assert found[:, 0] == pytest.approx(np.array(expected))
+    assert found[:, 1] == pytest.approx(np.array(expected))
+    assert found[-1, 2] > 2.0
+
+
 # ---------------------------------------------------------------- noise of ranges
 
 
@@ -572,6 +621,15 @@ def test_mixtures_against_samples(error: RangeNoise) -> None:
     information = range_information(error)
     assert abs(score.mean()) < 5 * np.sqrt(information / count)
     assert (score**2).mean() == pytest.approx(information, rel=0.02)
+
+
+def test_lasting_nlos_is_taken_as_known() -> None:
+    fresh = RangeNoise(0.2, nlos=0.3, nlos_kind="constant")
+    lasting = replace(fresh, nlos_time=2.0)
+    assert range_information(lasting) == pytest.approx(25.0, rel=1e-6)
+    exponential = RangeNoise(0.2, nlos=0.3, nlos_time=2.0)
+    late = range_information(RangeNoise(0.2, nlos=1.0))
+    assert range_information(exponential) == pytest.approx(0.7 * 25.0 + 0.3 * late, rel=1e-6)
 
 
 def test_contamination_only_takes_information_away() -> None:
@@ -708,6 +766,8 @@ def test_what_cannot_be_bounded_is_refused() -> None:
     assert posterior_bound(scenario(Magnetometer()), 1, steps=1).rmse > 0
     with pytest.raises(ValueError, match="Inertial needs the sensor Imu"):
         posterior_bound(scenario(process=Inertial()), 1, steps=1)
+    with pytest.raises(ValueError, match="InsDriven needs the sensor Ins"):
+        posterior_bound(scenario(process=InsDriven()), 1, steps=1)
     for wrong in ({"runs": 0}, {"steps": 0}, {"steps": 1001}):
         with pytest.raises(ValueError, match="not allowed"):
             posterior_bound(scenario(), **wrong)

@@ -171,6 +171,40 @@ def test_loss_falls_on_each_direction_and_step_by_itself() -> None:
     assert abs(float(twice.mean()) - 0.49) < 5 * math.sqrt(0.5 / n)
 
 
+@pytest.mark.parametrize("network", [Network(failure=0.3), Network(4.0, (), 0.0, 0, 5, 0.3)])
+def test_broken_links_carry_nothing_either_way(network: Network) -> None:
+    """A share of all links in each step, drawn anew."""
+    n = 6 if network.dense(6) else 24
+    whole = World(
+        replace(make_scenario("indoor-v0", n_uavs=n), network=replace(network, failure=0.0)), 20
+    )
+    broken = World(replace(whole.scenario, network=network), 20)
+    ideal, seen = whole.reset(0), broken.reset(0)
+    idle, pairs = torch.zeros(20, n, 9), []
+    for k in range(40):
+        for name in ("links", *(["message_mask"] if k else [])):
+            assert torch.equal(seen[name], seen["range_mask"]), name
+        assert (seen["links"] <= ideal["links"]).all()
+        matrix = torch.zeros(2, 20, n, n)
+        for link, world in zip(matrix, (ideal, seen), strict=True):
+            senders = torch.arange(n).expand(20, n, n)
+            if "neighbours" in ideal:
+                senders = ideal["neighbours"].long()
+            link.scatter_add_(2, senders, world["links"])
+        there, left = (link > 0 for link in matrix)
+        both = there & there.mT
+        assert torch.equal((left & both), (left & both).mT)
+        pairs.append(torch.where(both.triu(), left, torch.nan).double())
+        whole.advance(idle)
+        broken.advance(idle)
+        ideal, seen = whole.observation(), broken.observation()
+    x = torch.stack(pairs)
+    count = int(x.isfinite().sum())
+    assert abs(float(x.nanmean()) - 0.7) < 5 * math.sqrt(0.21 / count)
+    twice = (x[1:] * x[:-1]).nanmean()
+    assert abs(float(twice) - 0.49) < 5 * math.sqrt(0.5 / count)
+
+
 @pytest.mark.parametrize("overrides", [{}, {"n_uavs": 24, "comm_radius": 4.0}])
 def test_lost_messages_are_neither_seen_nor_masked_in(overrides: dict[str, Any]) -> None:
     world = World(make_scenario("indoor-v0", message_loss=0.4, **overrides), 3)
@@ -221,6 +255,7 @@ def test_a_team_of_two_slots_is_dense_up_to_its_size() -> None:
     [
         ({"radius": 0.0}, "radius=0.0 is not allowed: a distance in m > 0"),
         ({"loss": 2.0}, "loss=2.0 is not allowed: a probability"),
+        ({"failure": -0.5}, "failure=-0.5 is not allowed: a probability"),
         ({"delay": -1}, "delay=-1 is not allowed: a number of steps"),
         ({"max_neighbours": 0}, "max_neighbours=0 is not allowed: at least one slot"),
     ],

@@ -19,9 +19,11 @@ from coloc_env.sensors import (
     AnchorRanging,
     Height,
     Imu,
+    Ins,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    PositionFix,
     RangeNoise,
     Ranging,
     Sensor,
@@ -144,6 +146,8 @@ def test_dropouts_and_independence_of_events() -> None:
         ({"nlos": 1.5}, "nlos=1.5 is not allowed: a probability"),
         ({"std": -1.0}, "std=-1.0 is not allowed: a size in m"),
         ({"nlos_kind": "odd"}, "nlos_kind='odd' is not allowed: one of exponential, constant"),
+        ({"nlos_time": 0.0}, "nlos_time=0.0 is not allowed: a time in s > 0"),
+        ({"nlos_time": math.inf}, "nlos_time=inf is not allowed: a time in s > 0"),
     ],
 )
 def test_range_noise_settings_are_checked(wrong: dict[str, Any], words: str) -> None:
@@ -504,6 +508,194 @@ def test_height() -> None:
     assert near(float(torch.stack(rate).mean()), 0.75, math.sqrt(0.19 / (30 * 600)))
     assert near(float(together.std()), 0.1, 0.1 / math.sqrt(2 * n))
     assert near(float(together.mean()), 0.0, 0.1 / math.sqrt(n))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_position_fixes(dim: int) -> None:
+    sensor = PositionFix(0.4, count=2)
+    world = planar(sensor)
+    if dim == 3:
+        world = World(replace(make_scenario("indoor-v0"), sensors=(sensor,)), 3)
+        world.reset(0)
+    error = []
+    for _ in range(200):
+        seen, truth = world.observation(), world.truth.position
+        others = torch.arange(truth.shape[1]) >= 2
+        assert (seen["position_fix_mask"][:, ~others] == 1).all()
+        assert not seen["position_fix_mask"][:, others].any()
+        assert not seen["position_fix"][:, others].any()
+        error.append((seen["position_fix"] - truth)[:, :2])
+        skip(world)
+    together = torch.stack(error).double().flatten(0, 2)
+    n = len(together)
+    assert ((together.std(0) / 0.4 - 1).abs() < 5 / math.sqrt(2 * n)).all()
+    assert (together.mean(0).abs() < 5 * 0.4 / math.sqrt(n)).all()
+    across = torch.corrcoef(together.T) - torch.eye(dim)
+    assert float(across.abs().max()) < 5 / math.sqrt(n)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "words"),
+    [
+        (PositionFix, {"std": -1.0}, "std=-1.0 is not allowed: a standard deviation in m ≥ 0"),
+        (PositionFix, {"count": 0}, "count=0 is not allowed: at least one UAV"),
+        (Ins, {"std": -1.0}, "std=-1.0 is not allowed: a standard deviation in m/s ≥ 0"),
+        (Ins, {"bias": -1.0}, "bias=-1.0 is not allowed: a standard deviation in m/s ≥ 0"),
+        (Ins, {"bias_time": 0.0}, "bias_time=0.0 is not allowed: a time in s > 0"),
+    ],
+)
+def test_settings_of_fixes_and_ins_are_checked(kind: Any, wrong: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=f"{kind.__name__}: {words}"):
+        kind(**wrong)
+
+
+# ---------------------------------------------------------------------------------------- ins
+
+
+def biases(sensor: Ins, rows: int, steps: int, window: int | None = None) -> Tensor:
+    """What a noiseless INS says too much, [B, K, N · d], from step 1 on."""
+    world = planar(replace(sensor, std=0.0), n_uavs=6)
+    clean = World(replace(world.scenario, sensors=(Ins(0.0),)), rows)
+    world = World(world.scenario, rows, window=window)
+    world.reset(0)
+    clean.reset(0)
+    found = []
+    for _ in range(steps):
+        skip(world)
+        skip(clean)
+        found.append((world.observation()["ins"] - clean.observation()["ins"]).flatten(1))
+    return torch.stack(found, 1)
+
+
+def test_without_noise_the_ins_adds_up_to_the_path() -> None:
+    world = planar(Ins(0.0))
+    place = world.truth.position
+    assert not world.observation()["ins"].any()  # no step has passed
+    for _ in range(100):
+        skip(world)
+        place = place + 0.1 * world.observation()["ins"]
+    torch.testing.assert_close(place, world.truth.position, rtol=0, atol=1e-5)
+
+
+def test_white_noise_of_the_ins() -> None:
+    noisy, clean = planar(Ins(0.5), n_uavs=50), planar(Ins(0.0), n_uavs=50)
+    found = []
+    for _ in range(60):
+        skip(noisy)
+        skip(clean)
+        found.append(noisy.observation()["ins"] - clean.observation()["ins"])
+    error = torch.stack(found).double().flatten(1)  # [60, …]
+    assert near(float(error.mean()), 0.0, 0.5 / math.sqrt(error.numel()))
+    assert near(float(error.std()), 0.5, 0.5 / math.sqrt(2 * error.numel()))
+    lagged = (error[1:] * error[:-1]).mean()
+    assert near(float(lagged), 0.0, 0.25 / math.sqrt(error.numel()))
+
+
+@pytest.mark.parametrize("time", [0.05, 2.0, 60.0])
+def test_the_bias_is_a_stationary_gauss_markov_process(time: float) -> None:
+    """Variance, correlation exp(−t / τ) and kurtosis over many rows, whatever the step."""
+    rows, steps = 1000, 45
+    x = biases(Ins(0.0, 0.3, time), rows, steps).double().movedim(1, 0).flatten(1) / 0.3
+    n = x.shape[1]  # independent paths of one UAV and axis each
+    for k in (0, 20, steps - 1):
+        assert near(float(x[k].mean()), 0.0, 1 / math.sqrt(n))
+        assert near(float(x[k].square().mean()), 1.0, math.sqrt(2 / n))
+        kurtosis = float((x[k] ** 4).mean())
+        assert abs(kurtosis - (3 - 1.5 / 32)) < 5 * math.sqrt(96 / n)
+    for lag in (1, 5, 20):
+        expected = math.exp(-lag * 0.1 / time)
+        for k in (0, 24):
+            found = float((x[k] * x[k + lag]).mean())
+            assert near(found, expected, math.sqrt(2 / n))
+    across = torch.corrcoef(x[0].view(rows, -1).T) - torch.eye(12)
+    assert float(across.abs().max()) < 5 / math.sqrt(rows)
+
+
+def test_the_bias_does_not_depend_on_rows_and_windows() -> None:
+    sensor = Ins(0.0, 0.3, 2.0)
+    together = biases(sensor, 7, 45)
+    for window in (1, 7, 50):
+        assert torch.equal(biases(sensor, 7, 45, window), together)
+    assert torch.equal(biases(sensor, 1, 45), together[:1])
+
+
+# ------------------------------------------------------------------------------- lasting NLOS
+
+
+def lasting(rows: int, steps: int, window: int | None = None, **more: Any) -> Tensor:
+    """Whether each of 15 links is NLOS, [K, B, 15]."""
+    noise_ = RangeNoise(0.0, nlos=0.3, nlos_kind="constant", nlos_bias=100.0, nlos_time=0.5)
+    world = planar(Ranging(noise_, **more), n_uavs=6)
+    world = World(replace(world.scenario, horizon=500), rows, window=window)
+    world.reset(0)
+    found, (i, j) = [], torch.triu_indices(6, 6, 1)
+    for _ in range(steps):
+        ranges = world.observation()["ranges"]
+        assert torch.equal(ranges, ranges.mT)
+        found.append(ranges[:, i, j] > 50.0)
+        skip(world)
+    return torch.stack(found)
+
+
+def test_nlos_lasts_as_a_two_state_markov_chain() -> None:
+    """Share π, correlation exp(−t / τ), and nothing but the last state matters."""
+    x = lasting(400, 120).double()
+    links = x[0].numel()
+    for k in (0, 1, 30, 70, 119):  # also beyond what is looked back, 50 steps
+        assert near(float(x[k].mean()), 0.3, math.sqrt(0.21 / links))
+    for k in (0, 60, 100):
+        for lag in (1, 3, 10):
+            found = float(((x[k] - 0.3) * (x[k + lag] - 0.3)).mean()) / 0.21
+            assert near(found, math.exp(-lag * 0.1 / 0.5), 1.5 / math.sqrt(links))
+    before, now, after = x[:-2].bool(), x[1:-1].bool(), x[2:]
+    stay = 1 - 0.7 * (1 - math.exp(-0.2))
+    for past in (before, ~before):
+        kept = after[past & now]
+        spread = math.sqrt(stay * (1 - stay) / len(kept))
+        assert near(float(kept.mean()), stay, 2 * spread)
+    apart = torch.corrcoef(x[60].T) - torch.eye(15)
+    assert float(apart.abs().max()) < 5 / math.sqrt(400)
+
+
+def test_lasting_nlos_does_not_depend_on_rows_and_windows() -> None:
+    together = lasting(5, 130)
+    for window in (1, 7, 64):
+        assert torch.equal(lasting(5, 130, window), together)
+    assert torch.equal(lasting(1, 130), together[:, :1])
+
+
+def test_a_delayed_range_is_nlos_as_it_was() -> None:
+    now, late = lasting(5, 80), lasting(5, 80, latency=3)
+    assert torch.equal(late[3:], now[:-3])
+
+
+def test_neighbour_slots_tell_the_same_of_a_link() -> None:
+    noise_ = RangeNoise(0.0, nlos=0.3, nlos_kind="constant", nlos_bias=100.0, nlos_time=0.5)
+    dense, slots = (
+        planar(Ranging(noise_), n_uavs=6, network=Network(max_neighbours=m)) for m in (6, 4)
+    )
+    for _ in range(20):
+        everyone, few = dense.observation(), slots.observation()
+        expected = everyone["ranges"].gather(2, few["neighbours"].long())
+        assert torch.equal(few["ranges"], expected * few["range_mask"])
+        skip(dense)
+        skip(slots)
+
+
+def test_anchors_are_nlos_for_a_while_too() -> None:
+    noise_ = RangeNoise(0.0, nlos=0.3, nlos_kind="constant", nlos_bias=100.0, nlos_time=0.5)
+    corners = ((0.0, 0.0), (20.0, 0.0), (0.0, 12.0))
+    world, found = planar(AnchorRanging(corners, noise_, blocked=(2,)), n_uavs=200), []
+    for _ in range(40):
+        found.append(world.observation()["anchor_ranges"] > 50.0)
+        skip(world)
+    late = torch.stack(found).double()
+    assert (late[..., 2] == 1).all()
+    x = late[..., :2].flatten(1)
+    assert near(float(x[30].mean()), 0.3, math.sqrt(0.21 / x.shape[1]))
+    kept = float((x[30] * x[33]).mean())
+    expected = 0.09 + 0.21 * math.exp(-0.6)
+    assert near(kept, expected, 0.5 / math.sqrt(x.shape[1]))
 
 
 @pytest.mark.parametrize("sensor", [Odometry(), LandmarkBearings(), UavBearings()])

@@ -13,12 +13,21 @@ from coloc_env.motion import MOTIONS, Circle, RandomVelocity, Square, Waypoints
 ROOM = (30.0, 20.0, 5.0)
 ROUTE = Waypoints(route=((2.0, 2.0, 1.0), (9.0, 3.0, 2.0), (9.0, 3.0, 4.0), (5.0, 8.0, 1.5)))
 SHARP = Square(sharp=True)
-ALL = {**MOTIONS, "route": ROUTE, "sharp": SHARP, "fast_swarm": RandomVelocity(v_max=50.0)}
-JUMPY = {"sharp", "random_velocity", "fast_swarm"}  # velocity jumps at corners or walls
+BOXES = RandomVelocity(
+    boxes=(((0.0, 0.0, 0.0), (8.0, 20.0, 5.0)), ((20.0, 5.0, 1.0), (30.0, 9.0, 5.0)))
+)
+ALL = {
+    **MOTIONS,
+    "route": ROUTE,
+    "sharp": SHARP,
+    "fast_swarm": RandomVelocity(v_max=50.0),
+    "boxes": BOXES,
+}
+JUMPY = {"sharp", "random_velocity", "fast_swarm", "boxes"}  # velocity jumps at corners or walls
 SMOOTH = [name for name in ALL if name not in JUMPY]
 LEVEL = [name for name in ALL if name != "aggressive"]
 ALIGNED = [name for name in SMOOTH if name not in {"aggressive", "formation"}]
-FLAT = [name for name in ALL if name not in {"helix", "route"}]  # those that fly in 2-D
+FLAT = [name for name in ALL if name not in {"helix", "route", "boxes"}]  # those that fly in 2-D
 EVERYWHERE = [name for name in MOTIONS if name != "circle"]  # fit any room as they are
 
 

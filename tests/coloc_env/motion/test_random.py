@@ -124,6 +124,27 @@ def test_walls_reflect(fly, arena):
     assert (truth.velocity[:, 1:] * truth.velocity[:, :-1] < 0).any(1).all()
 
 
+def test_each_uav_keeps_to_its_box(fly, arena):
+    """Which are filled in proportion to their volumes, from the start on."""
+    boxes = (((0.0, 0.0, 0.0), (2.0, 5.0, 4.0)), ((3.0, 1.0, 0.0), (6.0, 5.0, 2.0)))
+    motion = RandomVelocity(v_max=8.0, boxes=boxes)
+    position = fly(motion, arena(6.0, 5.0, 4.0, n=40), SEEDS, 300).position
+    within = []
+    for low, high in torch.tensor(boxes).double():
+        within.append(((position >= low) & (position <= high)).all(-1))
+        reached = position[within[-1].all(1).unsqueeze(1).expand(position.shape[:3])]
+        torch.testing.assert_close(reached.amin(0), low, rtol=0, atol=0.05)
+        torch.testing.assert_close(reached.amax(0), high, rtol=0, atol=0.05)
+    first, second = (inside.all(1) for inside in within)
+    assert (first ^ second).all()
+    share = 40 / 64
+    spread = 5 * math.sqrt(share * (1 - share) / first.numel())
+    assert first.double().mean() == pytest.approx(share, abs=spread)
+    start = position[:, 0][second]
+    middle = torch.tensor(boxes[1]).double().mean(0)
+    torch.testing.assert_close(start.mean(0), middle, rtol=0, atol=0.1)
+
+
 def test_heading_is_that_of_the_vector_everywhere():
     angle = torch.linspace(-math.pi, math.pi, 10_001, dtype=torch.float64)
     torch.testing.assert_close(heading(angle.cos(), angle.sin()), angle, rtol=0, atol=1e-15 * 4)

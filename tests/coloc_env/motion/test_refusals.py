@@ -57,6 +57,12 @@ REFUSED = [
     (FormationChange(size=1.0, radius=1.0), "FormationChange: radius = 1 .* at most 0.5"),
     (FormationChange(blend=30.0), "blend = 30 s must be at most the period of 20 s"),
     (RandomVelocity(v_max=0.0), "RandomVelocity: v_max must be positive, not 0.0"),
+    (
+        RandomVelocity(boxes=(((0.0, 0.0, 0.0), (5.0, 1.0, 1.0)),)),
+        r"RandomVelocity: boxes: .*5.0.* is no box .* in the arena from \(0.0, 0.0, 0.0\) to",
+    ),
+    (RandomVelocity(boxes=(((0.0, 0.0), (1.0, 1.0)),)), "is no box"),
+    (RandomVelocity(boxes=(((0.0, 2.0, 0.0), (1.0, 2.0, 1.0)),)), "is no box"),
     (RandomVelocity(lag=0.05), "RandomVelocity: lag = 0.05 s .* longer than the step of 0.1 s"),
 ]
 

@@ -1,0 +1,342 @@
+"""``swarm-v0``: the box and its layouts, who is scored, and ranges as the ST-DCL paper has them."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+from torch import Tensor
+from torchrl.envs import check_env_specs
+
+from coloc_env.batched import CoLocEnv
+from coloc_env.bounds import posterior_bound
+from coloc_env.observation import action_bounds, all_leaves
+from coloc_env.parallel import CoLocParallelEnv, parallel_env
+from coloc_env.scenario import REWARDS, InsDriven
+from coloc_env.scenarios import make_scenario, overrides_of, parse_override
+from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging
+from coloc_env.world import World
+
+TROUBLE: dict[str, Any] = {
+    "n_uavs": 10,
+    "anchors": 0.3,
+    "layout": "u",
+    "nlos": 0.3,
+    "nlos_time": 4.0,
+    "nlos_kind": "exponential",
+    "uwb_tail": 0.2,
+    "link_failure": 0.3,
+    "message_loss": 0.1,
+    "failure_rate": 0.3,
+}
+
+
+def flown(steps: int, seeds: list[int], window: int | None = None, **overrides: Any) -> Tensor:
+    """Positions [K, B, N, 3] and every leaf, side by side [K, B, N, F]."""
+    world, told = World(make_scenario("swarm-v0", **overrides), len(seeds), window=window), []
+    seen, n = world.reset(seeds), world.scenario.arena.n_uavs
+    for k in range(steps):
+        told.append(torch.cat((world.truth.position, *seen.leaves.values()), -1))
+        world.advance(torch.full((len(seeds), n, 9), float(k)))
+        seen = world.observation()
+    return torch.stack(told)
+
+
+# ---------------------------------------------------------------- as published
+
+
+def test_the_swarm_is_the_papers() -> None:
+    scenario = make_scenario("swarm-v0")
+    arena = scenario.arena
+    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.guides) == (200, 1.0, 100, 30)
+    assert (arena.low, arena.high) == ((0.0, 0.0, 0.0), (10e3, 10e3, 5e3))
+    assert scenario.network.radius == 5e3
+    assert scenario.prior.position_std == 50.0
+    error = RangeNoise(10.0, nlos=0.15, nlos_bias=25.0, nlos_kind="constant", tail_std=50.0)
+    own = (Ins(0.5, 0.3, 60.0), PositionFix(0.1, 30))
+    assert scenario.sensors == (*own, Ranging(error))
+    assert scenario.believed.sensors == (*own, Ranging(RangeNoise(std=10.0)))
+    assert scenario.believed.process == InsDriven()
+    assert scenario.believed.slots == 200
+    widths = {name: leaf.width for name, leaf in all_leaves(scenario).items()}
+    assert widths == {
+        "ins": 3,
+        "position_fix": 3,
+        "position_fix_mask": 1,
+        "ranges": 200,
+        "range_mask": 200,
+        "links": 200,
+        "messages": 1800,
+        "message_mask": 200,
+        "prior": 15,
+    }
+
+
+def test_without_anchors_nobody_has_a_fix() -> None:
+    scenario = make_scenario("swarm-v0", anchors=0.0)
+    assert scenario.guides == 0
+    assert "position_fix" not in all_leaves(scenario)
+
+
+def test_actions_reach_as_far_as_the_swarm_does() -> None:
+    low, high = action_bounds(make_scenario("swarm-v0").arena)
+    assert low == [-5e3, -5e3, -2.5e3] + [-200.0] * 3 + [-10.0] * 3
+    assert high == [15e3, 15e3, 7.5e3] + [200.0] * 3 + [10.0] * 3
+    assert action_bounds(make_scenario("indoor-v0").arena)[1][3:6] == [50.0] * 3
+
+
+def test_ranges_are_biased_on_a_share_of_the_links() -> None:
+    world = World(make_scenario("swarm-v0", uwb_std=0.0, n_uavs=100, comm_radius=4e3), 2)
+    seen, position = world.reset(0), world.truth.position
+    apart = (position.unsqueeze(1) - position.unsqueeze(2)).norm(dim=-1)
+    near = (apart <= 4e3) & ~torch.eye(100, dtype=torch.bool)
+    assert torch.equal(seen["range_mask"] > 0, near)
+    error = (seen["ranges"] - apart)[near]
+    late = (error > 12.5).double()
+    torch.testing.assert_close(error, 25.0 * late, rtol=0, atol=2e-3)
+    links = late.numel() / 2
+    assert float(late.mean()) == pytest.approx(0.15, abs=5 * (0.1275 / links) ** 0.5)
+
+
+@pytest.mark.parametrize("layout", ["random", "u", "o"])
+def test_layouts(layout: str) -> None:
+    """Nobody in the hole, and the rest filled evenly."""
+    world = World(make_scenario("swarm-v0", layout=layout, v_max=100.0, n_uavs=100), 4)
+    world.reset(0)
+    size = torch.tensor([10e3, 10e3, 5e3], dtype=torch.float64)
+    for _ in range(100):
+        share = (world.truth.position / size).flatten(0, 1)
+        x, y = share[:, 0], share[:, 1]
+        assert ((share >= 0) & (share <= 1)).all()
+        between, front, back = (x > 0.3) & (x < 0.7), y < 0.3, y > 0.7
+        hole = between & ~front & ~(back if layout == "o" else torch.zeros_like(back))
+        assert bool(hole.any()) == (layout == "random")
+        world.advance(torch.zeros(4, 100, 9))
+    open_ = {"random": 1.0, "u": 0.72, "o": 0.84}[layout]
+    expected = 0.12 / open_
+    for part in (between & front, between & back & (layout != "u")):
+        spread = 5 * math.sqrt(expected / 400)
+        assert float(part.double().mean()) == pytest.approx(
+            expected if part.any() else 0.0, abs=spread
+        )
+
+
+# ---------------------------------------------------------------- guides
+
+
+def test_guides_know_where_they_are_and_are_not_scored() -> None:
+    world = World(make_scenario("swarm-v0", n_uavs=10, anchors=0.3), 50)
+    seen = world.reset(0)
+    mask = seen["position_fix_mask"][..., 0]
+    assert torch.equal(mask, (torch.arange(10) < 3).float().expand(50, 10))
+    error = (seen["position_fix"] - world.truth.position)[:, :3]
+    assert float(error.std()) == pytest.approx(0.1, rel=5 / (2 * 450) ** 0.5)
+    assert not seen["position_fix"][:, 3:].any()
+    step = world.step(torch.zeros(50, 10, 9))
+    assert torch.equal(step.scored, (torch.arange(10) >= 3).expand(50, 10))
+    assert not step.error[:, :3].any()
+    assert (step.error[:, 3:] > 0).all()
+    assert (world.state().unflatten(-1, (10, -1))[..., -1] == step.scored).all()
+
+
+@pytest.mark.parametrize("reward", REWARDS)
+def test_guides_earn_nothing_and_say_so(reward: str) -> None:
+    env = parallel_env("swarm-v0", n_uavs=4, anchors=0.5, horizon=3, reward=reward)
+    _, infos = env.reset(seed=0)
+    assert {info["scored"] for info in infos.values()} == {0.0}
+    still = {agent: np.zeros(9, np.float32) for agent in env.agents}
+    _, rewards, _, _, infos = env.step(still)
+    assert [rewards[a] != 0 for a in env.possible_agents] == [False, False, True, True]
+    assert [infos[a]["scored"] for a in env.possible_agents] == [0.0, 0.0, 1.0, 1.0]
+    for guide in env.possible_agents[:2]:
+        assert infos[guide]["error"] == infos[guide]["episode_rmse"] == 0.0
+    if reward == "team":
+        scored = [infos[a]["error"] for a in env.possible_agents[2:]]
+        assert rewards["uav_2"] == rewards["uav_3"] == pytest.approx(-sum(scored) / 2)
+
+
+def test_the_bound_is_that_of_those_who_are_scored() -> None:
+    bound = posterior_bound(make_scenario("swarm-v0", n_uavs=6, anchors=0.5), 2, steps=5)
+    assert torch.equal(bound.scored, (torch.arange(6) >= 3).expand(2, 5, 6))
+    assert bound.mse[..., :3].max() < 3 * 0.1**2 + 1e-9
+    assert bound.mse[..., 3:].min() > 3 * 0.1**2
+
+
+# ---------------------------------------------------------------- options
+
+# One value other than the default for every override.
+CHANGED: dict[str, Any] = {
+    "n_uavs": 7,
+    "size": (9e3, 8e3, 4e3),
+    "layout": "o",
+    "v_max": 100.0,
+    "dt": 0.5,
+    "horizon": 17,
+    "anchors": 0.6,
+    "anchor_std": 2.0,
+    "uwb_std": 5.0,
+    "nlos": 0.5,
+    "nlos_bias": 40.0,
+    "nlos_kind": "exponential",
+    "nlos_time": 10.0,
+    "uwb_tail": 0.5,
+    "uwb_tail_std": 90.0,
+    "uwb_dropout": 0.5,
+    "ins_std": 1.0,
+    "ins_bias": 1.0,
+    "ins_bias_time": 5.0,
+    "comm_radius": 2e3,
+    "link_failure": 0.5,
+    "message_loss": 0.5,
+    "message_delay": 1,
+    "prior_std": 9.0,
+    "failure_rate": 1.0,
+    "reward": "squared",
+}
+# Overrides that show only together with another.
+WITH: dict[str, dict[str, Any]] = {
+    "uwb_tail_std": {"uwb_tail": 0.5},
+    "failure_rate": {"horizon": 4},
+}
+
+
+def told(**overrides: Any) -> tuple[Any, ...]:
+    """All that one small world does in four steps, and what its team believes."""
+    scenario = make_scenario("swarm-v0", **{"n_uavs": 6, "anchors": 0.3, "nlos": 0.4} | overrides)
+    world = World(scenario)
+    seen, brought = world.reset(0), []
+    for _ in range(4):
+        step = world.step(torch.ones(1, scenario.arena.n_uavs, 9))
+        brought.append(
+            {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
+        )
+        seen = world.observation()
+    return brought, scenario.horizon, scenario.believed
+
+
+def test_every_override_is_tried() -> None:
+    assert set(CHANGED) == set(overrides_of("swarm-v0"))
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_every_override_changes_something(name: str) -> None:
+    others = WITH.get(name, {})
+    assert told(**others) != told(**others, **{name: CHANGED[name]})
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_every_override_is_read_from_the_command_line(name: str) -> None:
+    value = CHANGED[name]
+    text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    assert parse_override("swarm-v0", f"{name}={text}") == (name, value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: at least one UAV"),
+        ({"dt": 0.0}, r"dt \(s\) and the sides of size \(m\) must be > 0"),
+        ({"size": (1e3, 1e3, 0.0)}, r"dt \(s\) and the sides of size \(m\) must be > 0"),
+        ({"size": (1e3, 1e3)}, "size=.* is not allowed: 3 numbers"),
+        ({"layout": "w"}, "layout='w' is not allowed: one of random, u, o"),
+        ({"anchors": 1.0}, r"anchors=1.0 is not allowed: a share in \[0, 1\)"),
+        ({"anchors": -0.1}, r"anchors=-0.1 is not allowed: a share in \[0, 1\)"),
+        ({"anchors": 0.9, "n_uavs": 3}, "guides=3 is not allowed: from 0 to fewer than the 3"),
+        ({"anchor_std": -1.0}, "std=-1.0 is not allowed: a standard deviation in m"),
+        ({"nlos_time": 0.0}, "nlos_time=0.0 is not allowed: a time in s > 0"),
+        ({"ins_bias": -1.0}, "bias=-1.0 is not allowed: a standard deviation in m/s"),
+        ({"ins_bias_time": 0.0}, "bias_time=0.0 is not allowed: a time in s > 0"),
+        ({"link_failure": 1.5}, "failure=1.5 is not allowed: a probability"),
+        ({"failure_rate": 1.5}, "failure_rate=1.5 is not allowed: a probability"),
+        ({"comm_radius": 0.0}, "radius=0.0 is not allowed: a distance in m > 0"),
+        ({"horizon": 0}, "horizon=0 is not allowed: at least one step"),
+        ({"reward": "best"}, "reward='best' is not allowed"),
+        ({"anchor": 0.3}, r"unknown option 'anchor' \(did you mean 'anchors'\?\)"),
+    ],
+)
+def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        make_scenario("swarm-v0", **overrides)
+    assert str(caught.value).startswith("swarm-v0: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_speed_that_makes_no_sense_is_named_when_the_world_starts() -> None:
+    with pytest.raises(ValueError, match=r"v_max must be positive, not 0\.0"):
+        World(make_scenario("swarm-v0", v_max=0.0)).reset(0)
+
+
+# ---------------------------------------------------------------- faces and seeds
+
+
+def truth(env: CoLocParallelEnv) -> dict[str, np.ndarray]:
+    """The true position and velocity, from the privileged state."""
+    rows = env.state().reshape(len(env.possible_agents), -1)
+    surely = np.full(3, -3.0, np.float32)
+    return {a: np.concatenate((rows[env.possible_agents.index(a)][:6], surely)) for a in env.agents}
+
+
+@pytest.mark.parametrize("overrides", [{"n_uavs": 5}, TROUBLE], ids=["plain", "trouble"])
+def test_both_faces_work(overrides: dict[str, Any]) -> None:
+    parallel_api_test(parallel_env("swarm-v0", horizon=12, **overrides), num_cycles=30)
+    parallel_seed_test(lambda: parallel_env("swarm-v0", horizon=12, **overrides))
+    check_env_specs(CoLocEnv("swarm-v0", num_envs=2, horizon=6, **overrides), seed=3)
+
+
+def test_the_truth_as_an_action_costs_nothing_over_the_whole_path() -> None:
+    env = parallel_env("swarm-v0", n_uavs=8)
+    env.reset(seed=1)
+    steps = 0
+    while env.agents:
+        _, rewards, _, _, infos = env.step(truth(env))
+        assert set(rewards.values()) == {0.0}
+        steps += 1
+    assert steps == 100
+    assert all(info["episode_max"] == 0 for info in infos.values())
+
+
+def test_a_row_of_a_batch_is_its_own_world_whatever_the_window() -> None:
+    seeds = [5, 0, 9, 2**40, 7]
+    together = flown(90, seeds, **TROUBLE)
+    for row, window in ((0, 1), (3, 7), (4, 64)):
+        alone = flown(90, seeds[row : row + 1], window, **TROUBLE)
+        assert torch.equal(alone, together[:, row : row + 1])
+
+
+def test_rows_that_are_reset_alone_are_worlds_of_their_seeds() -> None:
+    """With what lasts over steps (biases, NLOS) begun anew."""
+    scenario = make_scenario("swarm-v0", **TROUBLE)
+    fresh, world = World(scenario), World(scenario, 3, window=20)
+    world.reset(0)
+    idle = torch.zeros(3, 10, 9)
+    for _ in range(33):
+        world.advance(idle)
+    seen = world.reset(torch.tensor([0, 8, 0]), torch.tensor([False, True, False]))
+    alone = fresh.reset(8)
+    for _ in range(50):
+        for name, leaf in alone.leaves.items():
+            assert torch.equal(seen[name][1:2], leaf), name
+        world.advance(idle)
+        fresh.advance(idle[:1])
+        seen, alone = world.observation(), fresh.observation()
+
+
+def test_a_seed_fixes_the_whole_episode() -> None:
+    def episode(seed: int) -> list[Any]:
+        env = parallel_env("swarm-v0", **TROUBLE)
+        seen, _ = env.reset(seed=seed)
+        brought = [seen]
+        while env.agents:
+            still = dict.fromkeys(env.agents, np.ones(9, np.float32))
+            brought.append(env.step(still)[0])
+        return brought
+
+    first, again, other = episode(3), episode(3), episode(4)
+    assert len(first) == 101
+    for a, b in zip(first, again, strict=True):
+        assert a.keys() == b.keys()
+        for uav in a:
+            assert all(np.array_equal(a[uav][leaf], b[uav][leaf]) for leaf in a[uav])
+    assert not np.array_equal(first[0]["uav_0"]["ranges"], other[0]["uav_0"]["ranges"])
