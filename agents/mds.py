@@ -31,8 +31,10 @@ class MdsMap(SwarmFilter):
         enough = (now.fixed.sum(-1, keepdim=True) > d) & reached
         weight = torch.where(enough.any(-1, keepdim=True), now.fixed & reached, reached).double()
         weight = torch.where(weight.sum(-1, keepdim=True) > 0, weight, 1.0)
-        found = aligned(shape, now.place, weight)
-        off = ((found - now.place).square().sum(-1) * weight).sum(-1, keepdim=True)
+        weight = weight * now.place.isfinite().all(-1)
+        place = now.place.nan_to_num(0.0, 0.0, 0.0)
+        found = aligned(shape, place, weight)
+        off = ((found - place).square().sum(-1) * weight).sum(-1, keepdim=True)
         variance = off / (d * weight.sum(-1, keepdim=True))
         moves = reached & ~now.fixed
         return Found(

@@ -17,8 +17,6 @@ from coloc_env.scenario import Believed
 class _Joint(SwarmFilter):
     """Gauss–Newton with ``iterations`` a step."""
 
-    centralized = True
-
     def __init__(self, believed: Believed, confidence: Confidence, iterations: int) -> None:
         super().__init__(believed, confidence)
         if iterations < 1:

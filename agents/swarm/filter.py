@@ -70,6 +70,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
     it is connected to, and on the noise that ranges between UAVs with fixes show anywhere.
     """
 
+    centralized = True
+
     def __init__(self, believed: Believed, confidence: Confidence) -> None:
         super().__init__(believed)
         sensor = believed.sensor(Ranging)

@@ -11,7 +11,7 @@ from agents.swarm.links import lengths
 Weigh = Callable[
     [Float64[Tensor, "B N N"]], tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
 ]
-_NOTHING = 1e-9  # m⁻²: information on a UAV that nothing ties to an anchor
+_NOTHING = 1e-10  # m⁻²: information on a UAV that nothing ties to an anchor
 
 
 def fisher(

@@ -18,9 +18,10 @@ class Links:
 
 
 def links_of(observation: Observation) -> Links:
-    """The links that both ends report, from the leaves ``ranges`` and ``range_mask`` (single tags)
-    and, in teams with more UAVs than slots, ``neighbours``."""
-    ranges, mask = observation["ranges"].double(), observation["range_mask"] > 0
+    """The links that either end reports, from the leaves ``ranges`` and ``range_mask`` (single
+    tags) and, in teams with more UAVs than slots, ``neighbours``; no number, no link."""
+    ranges = observation["ranges"].double()
+    mask = (observation["range_mask"] > 0) & ranges.isfinite()
     n = ranges.shape[-2]
     if "neighbours" in observation:
         index = observation["neighbours"].to(torch.int64)
@@ -28,7 +29,7 @@ def links_of(observation: Observation) -> Links:
         wide = ranges.new_zeros(*mask.shape[:-1], n)
         # An empty slot names UAV 0: what it would write is written where it changes nothing.
         index = torch.where(mask, index, torch.arange(n, device=mask.device).unsqueeze(-1))
-        ranges = wide.scatter(-1, index, ranges * mask)
+        ranges = wide.scatter(-1, index, torch.where(mask, ranges, 0.0))
         mask = there.scatter(-1, index, mask)
     either = mask | mask.mT
     both = torch.where(mask, ranges, ranges.mT)

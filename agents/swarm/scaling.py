@@ -7,6 +7,7 @@ scaling (Torgerson 1952) gives a relative map, and the anchors turn, mirror and 
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
+from torch.nn import functional
 
 
 def shortest_paths(
@@ -26,7 +27,9 @@ def classical_scaling(paths: Float64[Tensor, "B N N"], dim: int) -> Float64[Tens
     squared = paths.square()
     centred = squared - squared.mean(-1, keepdim=True) - squared.mean(-2, keepdim=True)
     centred = -0.5 * (centred + squared.mean((-2, -1), keepdim=True))
+    missing = max(0, dim - paths.shape[-1])  # of dimensions that a team has too few members for
     values, vectors = torch.linalg.eigh(centred)
+    values, vectors = (functional.pad(x, (missing, 0)) for x in (values, vectors))
     return vectors[..., -dim:].flip(-1) * values[..., -dim:].flip(-1).clamp_min(0).sqrt().unsqueeze(
         -2
     )

@@ -99,6 +99,9 @@ CHOSEN = {
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "tags", "wsn"),
     "nnhpff": ("anchors", "tags", "wsn"),
+    **dict.fromkeys(("dwmds_st", "map"), ("nlos", "anchors", "slots", "swarm")),
+    "mds": ("nlos", "anchors", "slots"),
+    "gn": ("slots",),
 }
 ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm")]
 CASES = [
