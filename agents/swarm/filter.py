@@ -1,6 +1,7 @@
 """What localizers of whole swarms share: dead reckoning, position fixes, and weights of links."""
 
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -33,34 +34,27 @@ class SwarmBelief(TensorClass):
     errors: Float64[Tensor, "B N 2 3"]
 
 
+@dataclass(frozen=True)
 class Prepared:
     """What a step has to find positions from: everybody's ``place`` by dead reckoning or fix (m),
-    its ``variance`` (m² per axis) and what the step added to it, who is ``fixed``, the ``links``
-    and the error ``model``."""
+    its ``variance`` (m² per axis) and what the step ``added`` to it, who is ``fixed``, the
+    ``links``, and the ``model`` of their errors."""
 
-    def __init__(
-        self,
-        place: Float64[Tensor, "B N d"],
-        variance: Float64[Tensor, "B N"],
-        added: Float64[Tensor, "B N"],
-        fixed: Bool[Tensor, "B N"],
-        links: Links,
-        model: calibration.ErrorModel,
-    ) -> None:
-        self.place, self.variance, self.added = place, variance, added
-        self.fixed, self.links, self.model = fixed, links, model
+    place: Float64[Tensor, "B N d"]
+    variance: Float64[Tensor, "B N"]
+    added: Float64[Tensor, "B N"]
+    fixed: Bool[Tensor, "B N"]
+    links: Links
+    model: calibration.ErrorModel
 
 
+@dataclass(frozen=True)
 class Found:
     """Positions (m), their variance (m² per axis), and the joint covariance if there is one."""
 
-    def __init__(
-        self,
-        position: Float64[Tensor, "B N d"],
-        variance: Float64[Tensor, "B N"],
-        joint: Float64[Tensor, "B N d K"] | None = None,
-    ) -> None:
-        self.position, self.variance, self.joint = position, variance, joint
+    position: Float64[Tensor, "B N d"]
+    variance: Float64[Tensor, "B N"]
+    joint: Float64[Tensor, "B N d K"] | None = None
 
 
 class SwarmFilter(Localizer[SwarmBelief]):

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -27,24 +27,33 @@ def held_uniform(
     10 ``time`` steps, else the link's very first. (That of an earlier renewal would be forgotten
     with probability e⁻¹⁰.)
     """
-    back = math.ceil(_MEMORY * time)
-    renewal = -math.expm1(-1 / time)
-    shape = (len(rows), *links.shape)
-    start = noise.uniform(noise.fold(_wide(rows, shape), links), f"{stream}.first", 1)[..., 0]
-    value, age = start, torch.full(shape, back + 1, device=rows.device)
-    held = []
-    for step in range(min(0, max(-back, 1 - int(first.max()))), count):
-        at = first + step
-        keys = noise.fold(_wide(noise.fold(rows, at), shape), links)
-        drawn, chance = noise.uniform(keys, f"{stream}.renewal", 2).unbind(-1)
-        renewed = (chance < renewal) & (_wide(at, shape) > 0)
+    back, renewal = math.ceil(_MEMORY * time), -math.expm1(-1 / time)
+    numbers = links.flatten()
+
+    def draw(
+        at: Int64[Tensor, "*#m"], keys: Int64[Tensor, "*#m"], link: Int64[Tensor, "*#m"]
+    ) -> tuple[Float32[Tensor, "*m"], Bool[Tensor, "*m"]]:
+        """What would be drawn at a step, and whether it is."""
+        drawn, chance = noise.uniform(noise.fold(keys, link), f"{stream}.renewal", 2).unbind(-1)
+        return drawn, (chance < renewal) & (at > 0)
+
+    every = noise.fold(rows.unsqueeze(-1), numbers)
+    very_first = noise.uniform(every, f"{stream}.first", 1)[..., 0]
+    value, age = very_first.clone(), torch.full_like(every, back + 1)
+    row, link = torch.ones_like(every).nonzero().unbind(-1)
+    for ago in range(back + 1):  # back to the last renewal, for links where it is yet to be found
+        at = first - ago
+        drawn, renewed = draw(at[row], noise.fold(rows, at)[row], numbers[link])
+        found = renewed.nonzero()[:, 0]
+        value[row[found], link[found]] = drawn[found]
+        age[row[found], link[found]] = ago
+        left = (~renewed & (at > 1)[row]).nonzero()[:, 0]
+        row, link = row[left], link[left]
+    held = [value]
+    for step in range(1, count):
+        at = (first + step).unsqueeze(-1)
+        drawn, renewed = draw(at, noise.fold(rows.unsqueeze(-1), at), numbers)
         value = torch.where(renewed, drawn, value)
         age = torch.where(renewed, 0, age + 1)
-        if step >= 0:
-            held.append(torch.where(age <= back, value, start))
-    return torch.stack(held, 1)
-
-
-def _wide(x: Int64[Tensor, "R"], shape: tuple[int, ...]) -> Int64[Tensor, "R *l"]:
-    """One number a row, ready to meet those of the links."""
-    return x.view(-1, *[1] * (len(shape) - 1))
+        held.append(torch.where(age <= back, value, very_first))
+    return torch.stack(held, 1).unflatten(-1, links.shape)

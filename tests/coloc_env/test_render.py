@@ -10,6 +10,7 @@ from PIL import Image
 
 from coloc_env import make_scenario, parallel_env
 from coloc_env.render import Renderer, frame_to_png, save_animation
+from coloc_env.render.snapshot import take
 from coloc_env.world import World
 
 
@@ -51,6 +52,19 @@ def test_every_kind_of_scene_is_drawn(overrides, steps):
     assert frame.ndim == 3
     assert frame.shape[2] == 3
     assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 20  # something is on it
+
+
+def test_guides_are_drawn_where_they_are_and_count_for_nothing():
+    world = World(make_scenario("swarm-v0", n_uavs=8, anchors=0.4))
+    world.reset(0)
+    snapshot = take(world, torch.zeros(1, 8, 9))
+    assert np.array_equal(snapshot.position, world.truth.position[0].numpy())
+    assert np.isnan(snapshot.error[:3]).all()
+    assert np.isfinite(snapshot.error[3:]).all()
+    renderer = Renderer(world.scenario)
+    renderer.record(world, torch.zeros(1, 8, 9))
+    world.step(torch.zeros(1, 8, 9))
+    assert renderer.render(world, "rgb_array").dtype == np.uint8
 
 
 def test_same_history_same_picture_and_another_one_differs():
