@@ -42,6 +42,8 @@ def held_uniform(
     value, age = very_first.clone(), torch.full_like(every, back + 1)
     row, link = torch.ones_like(every).nonzero().unbind(-1)
     for ago in range(back + 1):  # back to the last renewal, for links where it is yet to be found
+        if not len(row):
+            break
         at = first - ago
         drawn, renewed = draw(at[row], noise.fold(rows, at)[row], numbers[link])
         found = renewed.nonzero()[:, 0]
