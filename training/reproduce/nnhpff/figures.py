@@ -118,7 +118,8 @@ def kidnapping(found: Mapping[str, tuple[Mapping[str, Runs], int, slice]]) -> Fi
             axes.fill_between(time, low, high, color=look["color"], alpha=0.15, linewidth=0)
             axes.plot(time, middle, linewidth=1.4, **look)
         axes.axhline(FAILED, color=MUTED, linewidth=0.8, linestyle=":")
-        axes.set(xlabel="time after it (s)", yscale="log", title=title)
+        axes.set(xlabel="time after it (s)", yscale="log")
+        axes.set_title(title, fontsize=9)
         axes.legend(fontsize=7)
     grid[0][0].set_ylabel("error (m)")
     return figure
