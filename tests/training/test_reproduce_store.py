@@ -143,7 +143,7 @@ def test_weights_of_learned_agents(agent: str) -> None:
     one = make(agent, scenario, weights="none")
     before = identity.weights_of(one)
     assert before is not None
-    networks = list(identity._modules(one, set()))
+    networks = [part for part in identity._parts(one, set()) if isinstance(part, nn.Module)]
     with torch.no_grad():
         next(networks[0].parameters()).add_(1.0)
     assert identity.weights_of(one) != before
