@@ -11,98 +11,9 @@ import torch
 from coloc_env.motion import MOTIONS
 from coloc_env.observation import all_leaves, box, observation_space, state_bounds
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior
-from coloc_env.scenarios import FAMILIES, make_scenario, overrides_of, parse_override
+from coloc_env.scenarios import FAMILIES, make_scenario, overrides_of
 from coloc_env.sensors import AnchorRanging, Imu, Landmarks, RangeNoise, Ranging
 from coloc_env.world import World
-
-# One value other than the default for every override of indoor-v0.
-CHANGED: dict[str, Any] = {
-    "n_uavs": 3,
-    "room": (20.0, 15.0, 4.0),
-    "dt": 0.05,
-    "horizon": 17,
-    "motion": "helix",
-    "landmarks": 7,
-    "landmark_std": 0.5,
-    "landmark_radius": 4.0,
-    "false_matches": 0.5,
-    "landmark_dropout": 0.5,
-    "range_only": (0.0, 1.0),
-    "uwb": False,
-    "uwb_std": 0.7,
-    "nlos": 0.5,
-    "nlos_bias": 2.0,
-    "nlos_kind": "constant",
-    "uwb_tail": 0.5,
-    "uwb_tail_std": 3.0,
-    "uwb_uniform": 0.5,
-    "uwb_impulse": 0.5,
-    "uwb_dropout": 0.5,
-    "uwb_delay": 1,
-    "anchors": 3,
-    "nlos_anchor": 1,
-    "accel_std": 0.4,
-    "gyro_std": 0.3,
-    "imu": False,
-    "imu_bias": True,
-    "accel_bias": 0.9,
-    "gyro_bias": 0.9,
-    "comm_radius": 3.0,
-    "max_neighbours": 2,
-    "message_loss": 0.5,
-    "message_delay": 1,
-    "walls": (14.0, 9.0, 0.0, 16.0, 11.0, 5.0),
-    "kidnap_at": 0.2,
-    "kidnapped": (0, 4),
-    "prior": "uniform",
-    "prior_std": 9.0,
-    "failure_rate": 1.0,
-    "reward": "squared",
-    "believed_uwb_std": 0.9,
-    "believed_imu_bias": True,
-}
-# Overrides that show only together with another.
-WITH: dict[str, dict[str, Any]] = {
-    "nlos_bias": {"nlos": 0.5},
-    "nlos_kind": {"nlos": 0.5},
-    "uwb_tail_std": {"uwb_tail": 0.5},
-    "nlos_anchor": {"anchors": 2},
-    "kidnapped": {"kidnap_at": 0.2},
-    "accel_bias": {"imu_bias": True},
-    "gyro_bias": {"imu_bias": True},
-    "failure_rate": {"horizon": 4},
-}
-
-
-def told(**overrides: Any) -> tuple[Any, ...]:
-    """All that one world does in four steps, and what its team believes."""
-    scenario = make_scenario("indoor-v0", **overrides)
-    world = World(scenario, 1)
-    seen, brought = world.reset(0), []
-    for _ in range(4):
-        step = world.step(torch.ones(1, scenario.arena.n_uavs, 9))
-        brought.append(
-            {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
-        )
-        seen = world.observation()
-    return brought, scenario.horizon, scenario.believed
-
-
-def test_every_override_is_tried() -> None:
-    assert set(CHANGED) == set(overrides_of("indoor-v0"))
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_changes_something(name: str) -> None:
-    others = WITH.get(name, {})
-    assert told(**others) != told(**others, **{name: CHANGED[name]})
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_is_read_from_the_command_line(name: str) -> None:
-    value = CHANGED[name]
-    text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    assert parse_override("indoor-v0", f"{name}={text}") == (name, value)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from coloc_env.bounds import posterior_bound
 from coloc_env.observation import action_bounds, all_leaves
 from coloc_env.parallel import CoLocParallelEnv, parallel_env
 from coloc_env.scenario import REWARDS, InsDriven
-from coloc_env.scenarios import make_scenario, overrides_of, parse_override
+from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging
 from coloc_env.world import World
 
@@ -165,72 +165,6 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
 
 
 # ---------------------------------------------------------------- options
-
-# One value other than the default for every override.
-CHANGED: dict[str, Any] = {
-    "n_uavs": 7,
-    "size": (9e3, 8e3, 4e3),
-    "layout": "o",
-    "v_max": 100.0,
-    "dt": 0.5,
-    "horizon": 17,
-    "anchors": 0.6,
-    "anchor_std": 2.0,
-    "uwb_std": 5.0,
-    "nlos": 0.5,
-    "nlos_bias": 40.0,
-    "nlos_kind": "exponential",
-    "nlos_time": 10.0,
-    "uwb_tail": 0.5,
-    "uwb_tail_std": 90.0,
-    "uwb_dropout": 0.5,
-    "ins_std": 1.0,
-    "ins_bias": 1.0,
-    "ins_bias_time": 5.0,
-    "comm_radius": 2e3,
-    "link_failure": 0.5,
-    "message_loss": 0.5,
-    "message_delay": 1,
-    "prior_std": 9.0,
-    "failure_rate": 1.0,
-    "reward": "squared",
-}
-# Overrides that show only together with another.
-WITH: dict[str, dict[str, Any]] = {
-    "uwb_tail_std": {"uwb_tail": 0.5},
-    "failure_rate": {"horizon": 4},
-}
-
-
-def told(**overrides: Any) -> tuple[Any, ...]:
-    """All that one small world does in four steps, and what its team believes."""
-    scenario = make_scenario("swarm-v0", **{"n_uavs": 6, "anchors": 0.3, "nlos": 0.4} | overrides)
-    world = World(scenario)
-    seen, brought = world.reset(0), []
-    for _ in range(4):
-        step = world.step(torch.ones(1, scenario.arena.n_uavs, 9))
-        brought.append(
-            {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
-        )
-        seen = world.observation()
-    return brought, scenario.horizon, scenario.believed
-
-
-def test_every_override_is_tried() -> None:
-    assert set(CHANGED) == set(overrides_of("swarm-v0"))
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_changes_something(name: str) -> None:
-    others = WITH.get(name, {})
-    assert told(**others) != told(**others, **{name: CHANGED[name]})
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_is_read_from_the_command_line(name: str) -> None:
-    value = CHANGED[name]
-    text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    assert parse_override("swarm-v0", f"{name}={text}") == (name, value)
 
 
 @pytest.mark.parametrize(

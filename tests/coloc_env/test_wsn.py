@@ -14,7 +14,7 @@ from coloc_env.motion import Kidnapped, Square
 from coloc_env.observation import all_leaves
 from coloc_env.parallel import CoLocParallelEnv, parallel_env
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario
-from coloc_env.scenarios import make_scenario, overrides_of, parse_override
+from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import AnchorRanging, RangeNoise
 from coloc_env.world import World
 
@@ -226,56 +226,6 @@ def test_everyone_is_carried_across_the_room() -> None:
 
 
 # ---------------------------------------------------------------- options
-
-
-# One value other than the default for every override.
-CHANGED: dict[str, Any] = {
-    "case": 3,
-    "n_uavs": 2,
-    "horizon": 17,
-    "anchors": 5,
-    "r_true": 0.5,
-    "r_believed": 0.5,
-    "q": 0.5,
-    "nlos": 0.5,
-    "nlos_anchor": 2,
-    "nlos_bias": 2.0,
-    "nlos_kind": "constant",
-    "dropout": 0.5,
-    "kidnap_at": 0.2,
-    "max_speed": 2.0,
-    "reward": "squared",
-}
-WITH: dict[str, dict[str, Any]] = {"nlos_bias": {"nlos": 0.5}, "nlos_kind": {"nlos": 0.5}}
-
-
-def told(**overrides: Any) -> tuple[Any, ...]:
-    """All that one world does in four steps, and what its team believes."""
-    scenario = make_scenario("wsn-v0", **overrides)
-    world = World(scenario)
-    seen, brought = world.reset(0), []
-    for _ in range(4):
-        step = world.step(torch.ones(1, scenario.arena.n_uavs, 6))
-        brought.append(
-            {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
-        )
-        seen = world.observation()
-    return brought, scenario.horizon, scenario.believed
-
-
-def test_every_override_is_tried() -> None:
-    assert set(CHANGED) == set(overrides_of("wsn-v0"))
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_changes_something(name: str) -> None:
-    others = WITH.get(name, {})
-    assert told(**others) != told(**others, **{name: CHANGED[name]})
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_every_override_is_read_from_the_command_line(name: str) -> None:
-    assert parse_override("wsn-v0", f"{name}={CHANGED[name]}") == (name, CHANGED[name])
 
 
 @pytest.mark.parametrize(
