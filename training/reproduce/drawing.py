@@ -20,6 +20,16 @@ def save(drawing: Callable[[], Figure], file: Path) -> None:
         figure.savefig(file, dpi=150, bbox_inches=page)
 
 
+def caption(drawing: Callable[..., Figure]) -> str:
+    """A drawing's docstring, as what stands below it."""
+    return " ".join((drawing.__doc__ or "").split())
+
+
+def headline(figure: Figure, title: str) -> None:
+    """The title of a figure."""
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
 def panels(
     rows: int,
     columns: int,
@@ -32,6 +42,6 @@ def panels(
     """A titled figure of ``size`` inches with a grid of axes."""
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    headline(figure, title)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
     return figure, [list(row) for row in grid]

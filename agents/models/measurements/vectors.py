@@ -1,6 +1,8 @@
 """Measurements that are linear in position or velocity: landmark vectors, fixes, heights,
 slowness."""
 
+from abc import abstractmethod
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -54,83 +56,74 @@ class LandmarkVectors(Measurement):
         )
 
 
-class PositionFixes(Measurement):
+class _Coordinates(Measurement):
+    """Some components of position or velocity themselves, as one measurement."""
+
+    def __init__(self, sensor: PositionFix | Height | SlowFlight) -> None:
+        self.variance = sensor.std**2
+
+    @abstractmethod
+    def components(self, dim: int) -> slice:
+        """Which of the state's (and of its error's)."""
+
+    @abstractmethod
+    def measured(self, observation: Observation) -> Float[Tensor, "B N c"] | float:
+        """What they were measured to be."""
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        part, z = self.components(process.dim), self.measured(observation)
+        if isinstance(z, Tensor):
+            z = z.to(x.dtype)
+        residual = (z - x[..., part]).unsqueeze(-2)
+        jacobian = x.new_zeros(*residual.shape, process.error_size)
+        jacobian[..., part] = torch.eye(residual.shape[-1], dtype=x.dtype, device=x.device)
+        mask = torch.ones(residual.shape[:-1], dtype=torch.bool, device=x.device)
+        if self.mask_leaf is not None:
+            mask = observation[self.mask_leaf] > 0
+        return Block(
+            residual=residual,
+            jacobian=jacobian,
+            variance=x.new_tensor(self.variance).expand_as(residual),
+            mask=mask,
+        )
+
+
+class PositionFixes(_Coordinates):
     """z = p + noise."""
 
     mask_leaf = "position_fix_mask"
 
-    def __init__(self, sensor: PositionFix) -> None:
-        self.variance = sensor.std**2
+    def components(self, dim: int) -> slice:
+        return slice(0, dim)
 
-    def linearize(
-        self,
-        process: Process,
-        x: Float[Tensor, "B N S"],
-        observation: Observation,
-        neighbours: Neighbours,
-        derivatives: bool = True,
-    ) -> Block:
-        d = process.dim
-        residual = observation["position_fix"].to(x.dtype).unsqueeze(-2) - x[..., None, :d]
-        jacobian = x.new_zeros(*residual.shape, process.error_size)
-        jacobian[..., :d] = torch.eye(d, dtype=x.dtype, device=x.device)
-        return Block(
-            residual=residual,
-            jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
-            mask=observation["position_fix_mask"] > 0,
-        )
+    def measured(self, observation: Observation) -> Float[Tensor, "B N d"]:
+        return observation["position_fix"]
 
 
-class Heights(Measurement):
+class Heights(_Coordinates):
     """z of the position."""
 
     mask_leaf = "height_mask"
 
-    def __init__(self, sensor: Height) -> None:
-        self.variance = sensor.std**2
+    def components(self, dim: int) -> slice:
+        return slice(2, 3)
 
-    def linearize(
-        self,
-        process: Process,
-        x: Float[Tensor, "B N S"],
-        observation: Observation,
-        neighbours: Neighbours,
-        derivatives: bool = True,
-    ) -> Block:
-        z = observation["height"].to(x.dtype).unsqueeze(-1)
-        residual = z - x[..., None, 2:3]
-        jacobian = x.new_zeros(*residual.shape, process.error_size)
-        jacobian[..., 2] = 1.0
-        return Block(
-            residual=residual,
-            jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
-            mask=observation["height_mask"] > 0,
-        )
+    def measured(self, observation: Observation) -> Float[Tensor, "B N 1"]:
+        return observation["height"]
 
 
-class Slowness(Measurement):
+class Slowness(_Coordinates):
     """Velocity about zero."""
 
-    def __init__(self, sensor: SlowFlight) -> None:
-        self.variance = sensor.std**2
+    def components(self, dim: int) -> slice:
+        return slice(dim, 2 * dim)
 
-    def linearize(
-        self,
-        process: Process,
-        x: Float[Tensor, "B N S"],
-        observation: Observation,
-        neighbours: Neighbours,
-        derivatives: bool = True,
-    ) -> Block:
-        d = process.dim
-        residual = -x[..., None, d : 2 * d]
-        jacobian = x.new_zeros(*residual.shape, process.error_size)
-        jacobian[..., d : 2 * d] = torch.eye(d, dtype=x.dtype, device=x.device)
-        return Block(
-            residual=residual,
-            jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
-            mask=torch.ones(residual.shape[:-1], dtype=torch.bool, device=x.device),
-        )
+    def measured(self, observation: Observation) -> float:
+        return 0.0

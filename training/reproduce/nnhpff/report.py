@@ -141,6 +141,6 @@ def _draw(drawings: Mapping[str, Callable[[], Figure]], folder: Path) -> Text:
     text: Text = []
     for name, drawn in drawings.items():
         drawing.save(drawn, folder / name)
-        caption = " ".join((getattr(drawn, "func", drawn).__doc__ or "").split())
-        text += [f"![{caption}]({name})", "", f"*{caption}*", ""]
+        words = drawing.caption(getattr(drawn, "func", drawn))
+        text += [f"![{words}]({name})", "", f"*{words}*", ""]
     return text

@@ -1,23 +1,23 @@
 """The paper's figures 2 to 9, redrawn from our runs."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Bbox
 from scipy.ndimage import uniform_filter1d
 
 from coloc_env.render.style import INK, MUTED, rgb, uav_colours
 from coloc_env.world import World
 from training import metrics
-from training.figures import BOUND, STYLE, log_axis
+from training.figures import BOUND, log_axis
 from training.metrics import Floats
+from training.reproduce import drawing
 from training.reproduce.pfnn import paper
 from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.plan import ablation_agents
@@ -57,18 +57,15 @@ def draw(flown: Flown, folder: Path) -> dict[str, str]:
         cdf,
     )
     captions = {}
-    for name, drawing in zip(FILES, drawings, strict=True):
-        if drawing is ablation:
+    for name, drawn in zip(FILES, drawings, strict=True):
+        if drawn is ablation:
             needs = set(ablation_agents())
         else:
-            needs = set(_LINES) if drawing is cdf else {SHOWN}
+            needs = set(_LINES) if drawn is cdf else {SHOWN}
         if not needs & flown.tables.agents.keys():
             continue
-        with mpl.rc_context(STYLE):
-            figure = drawing(flown)
-            page = Bbox.union([figure.bbox_inches, figure.get_tightbbox()])
-            figure.savefig(folder / name, dpi=150, bbox_inches=page)
-        captions[name] = " ".join((drawing.__doc__ or "").split())
+        drawing.save(partial(drawn, flown), folder / name)
+        captions[name] = drawing.caption(drawn)
     return captions
 
 
@@ -129,7 +126,7 @@ def trajectories(flown: Flown) -> Figure:
     dashed = Line2D([], [], color=INK, linestyle="--", linewidth=0.8, label="estimate")
     figure.legend(handles=[*lines, dashed], loc="center right")
     figure.subplots_adjust(left=0.0, right=0.82, bottom=0.0, top=0.98)
-    _title(figure, f"Trajectories · PF-NN, seed {results.seed}")
+    drawing.headline(figure, f"Trajectories · PF-NN, seed {results.seed}")
     return figure
 
 
@@ -258,14 +255,10 @@ def cdf(flown: Flown) -> Figure:
 def _panels(
     count: int, height: float, title: str, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(7.5 if count == 1 else 9.5, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    _title(figure, title)
-    return figure, list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
-
-
-def _title(figure: Figure, title: str) -> None:
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    """A row of so many."""
+    size = (7.5 if count == 1 else 9.5, height)
+    figure, (row,) = drawing.panels(1, count, size, title, sharey=sharey)
+    return figure, row
 
 
 def _over_time(
@@ -274,23 +267,21 @@ def _over_time(
     """A panel for each UAV with two lines [K, N]."""
     colours = _uavs(flown)
     rows = -(-len(colours) // _ACROSS)
-    figure = Figure(figsize=(9.5, 1.0 + 1.9 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    _title(figure, f"{title} · PF-NN, {flown.tables.runs} runs")
-    grid = figure.subplots(rows, _ACROSS, squeeze=False, sharex=True, sharey=True)
-    panels, time = list(grid.flat), _time(flown)
-    for axes in panels[len(colours) :]:
+    size, headline = (9.5, 1.0 + 1.9 * rows), f"{title} · PF-NN, {flown.tables.runs} runs"
+    figure, grid = drawing.panels(rows, _ACROSS, size, headline, sharex=True, sharey=True)
+    every, time = [axes for row in grid for axes in row], _time(flown)
+    for axes in every[len(colours) :]:
         axes.set_visible(False)
-    for i, (axes, colour) in enumerate(zip(panels, colours, strict=False)):
+    for i, (axes, colour) in enumerate(zip(every, colours, strict=False)):
         axes.plot(time, thin[:, i], color=colour, linewidth=0.5, alpha=0.5)
         axes.plot(time, bold[:, i], color=colour, linewidth=1.5)
         axes.set_title(_name(i), fontsize=9.5)
         axes.set_xlim(0.0, max(float(time[-1]), 1e-3))
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
-    for axes in grid[:, 0]:
-        axes.set_ylabel(label)
-    return figure, panels[: len(colours)]
+    for row in grid:
+        row[0].set_ylabel(label)
+    return figure, every[: len(colours)]
 
 
 def _steps(axes: Axes, values: Floats, **look: Any) -> None:
