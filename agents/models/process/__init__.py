@@ -1,0 +1,44 @@
+"""What a team believes of its motion: one interface, four models, batched over anything.
+
+A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the
+tangent space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position
+is always ``x[..., :d]``, velocity ``x[..., d:2d]`` and the position's error ``δ[..., :d]``.
+"""
+
+from agents.models.process.base import Process
+from agents.models.process.constant_velocity import ConstantVelocityProcess
+from agents.models.process.inertial import InertialProcess
+from agents.models.process.reckoned import InsProcess, WheeledProcess
+from coloc_env import scenario as believed_processes
+from coloc_env.scenario import Believed
+from coloc_env.sensors import Imu, Ins, Odometry
+
+__all__ = [
+    "ConstantVelocityProcess",
+    "InertialProcess",
+    "InsProcess",
+    "Process",
+    "WheeledProcess",
+    "make_process",
+]
+
+
+def make_process(believed: Believed) -> Process:
+    """The motion model that a team believes in; ValueError if a sensor it needs is missing."""
+    settings, arena = believed.process, believed.arena
+    if isinstance(settings, believed_processes.ConstantVelocity):
+        return ConstantVelocityProcess(arena.dim, arena.dt, settings)
+    if isinstance(settings, believed_processes.Inertial):
+        imu = believed.sensor(Imu)
+        if imu is None:
+            raise ValueError("the believed motion is inertial, but the team has no IMU")
+        return InertialProcess(arena.dt, imu, settings)
+    if isinstance(settings, believed_processes.InsDriven):
+        ins = believed.sensor(Ins)
+        if ins is None:
+            raise ValueError("the believed motion is driven by an INS, but the team has none")
+        return InsProcess(arena.dim, arena.dt, ins, settings)
+    odometry = believed.sensor(Odometry)
+    if odometry is None:
+        raise ValueError("the believed motion is wheeled, but the team has no odometry")
+    return WheeledProcess(arena.dt, odometry)
