@@ -1,6 +1,8 @@
 """A tiny localizer for the tests, registered while a module of them runs, and made-up results."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,3 +140,29 @@ def localizers() -> Iterator[None]:
     LOCALIZERS["test_still"] = Still
     yield
     del LOCALIZERS["test_still"]
+
+
+@pytest.fixture
+def interrupted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[Any, str, int], AbstractContextManager[None]]:
+    """``with interrupted(owner, name, call)``: inside, the so many-th call of a function or method
+    is interrupted, and that must end what is done there."""
+
+    @contextmanager
+    def at(owner: Any, name: str, call: int) -> Iterator[None]:
+        whole, calls = getattr(owner, name), 0
+
+        def dies(*args: Any, **options: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == call:
+                raise KeyboardInterrupt
+            return whole(*args, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, dies)
+            with pytest.raises(KeyboardInterrupt):
+                yield
+
+    return at

@@ -3,7 +3,7 @@
 import csv
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -132,23 +132,12 @@ def test_interrupted_after_an_epoch(
     kind: tuple[str, dict[str, Any]],
     unbroken: dict[str, bytes],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    interrupted: Callable[..., Any],
 ) -> None:
     """In the second epoch, with its first batch trained on: to the same bits as if it never had
     been, whatever else was drawn meanwhile."""
-    figures, calls = mappo._figures, 0
-
-    def dies(batch: TensorDictBase) -> dict[str, float]:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
-            raise KeyboardInterrupt
-        return figures(batch)
-
-    monkeypatch.setattr(mappo, "_figures", dies)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(mappo, "_figures", 4):
         runs.start(*kind, tmp_path / "run", quiet)
-    monkeypatch.undo()
     assert (tmp_path / "run/state.safetensors").exists()
     torch.manual_seed(77)
     runs.resume(tmp_path / "run", quiet)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from agents import make
 from agents.checkpoint import untrained
@@ -229,22 +230,11 @@ def test_same_seed_same_weights(unbroken: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("losses", [2, LOSSES + 2, 2 * LOSSES])
 def test_interrupted_in_training(
-    unbroken: Path, losses: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    unbroken: Path, losses: int, tmp_path: Path, interrupted: Callable[..., Any]
 ) -> None:
     """At the first step, at the first after a save point, and at the last."""
-    forward, calls = DetectorLoss.forward, 0
-
-    def dies(self: nn.Module, tensordict: Any) -> TensorDict:
-        nonlocal calls
-        calls += 1
-        if calls == losses:
-            raise KeyboardInterrupt
-        return forward(self, tensordict)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(DetectorLoss, "forward", dies)
-        with pytest.raises(KeyboardInterrupt):
-            runs.start("nnhpff", SMALL, tmp_path / "run", quiet)
+    with interrupted(DetectorLoss, "forward", losses):
+        runs.start("nnhpff", SMALL, tmp_path / "run", quiet)
     assert (tmp_path / "run/state.safetensors").exists() == (losses > LOSSES)
     assert not (tmp_path / "run/nnhpff.safetensors").exists()
     runs.resume(tmp_path / "run", quiet)

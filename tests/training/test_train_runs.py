@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from torch import nn
 
 from training import pfnn, runs, savepoints
 
@@ -56,21 +57,10 @@ def test_interrupted_in_training(
     unbroken: dict[str, bytes],
     losses: int,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    interrupted: Callable[..., Any],
 ) -> None:
-    forward, calls = pfnn.CorrectorLoss.forward, 0
-
-    def dies(self: nn.Module, tensordict: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == losses:
-            raise KeyboardInterrupt
-        return forward(self, tensordict)
-
-    monkeypatch.setattr(pfnn.CorrectorLoss, "forward", dies)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(pfnn.CorrectorLoss, "forward", losses):
         runs.start("pfnn", {"mode": mode} | SMALL, tmp_path / "run", quiet)
-    monkeypatch.undo()
     runs.resume(tmp_path / "run", quiet)
     assert outcome(tmp_path / "run") == unbroken
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from stable_baselines3 import PPO
 from torch import Tensor
 
 from agents import make
@@ -84,22 +84,11 @@ def test_interrupted_in_training(
     options: dict[str, Any],
     unbroken: dict[str, bytes],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    interrupted: Callable[..., Any],
 ) -> None:
     """In the middle of the second epoch: it ends in the same bits as if it never had been."""
-    train, calls = PPO.train, 0
-
-    def dies(self: PPO) -> None:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
-            raise KeyboardInterrupt
-        train(self)
-
-    monkeypatch.setattr(sb3_ppo.PPO, "train", dies)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(sb3_ppo.PPO, "train", 4):
         runs.start("sb3-ppo", options, tmp_path / "run", quiet)
-    monkeypatch.undo()
     assert (tmp_path / "run/state.safetensors").exists()
     torch.manual_seed(77)
     np.random.seed(77)  # noqa: NPY002 (SB3 draws from it)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from agents import make
@@ -221,22 +221,11 @@ def test_same_seed_same_weights(unbroken: dict[str, bytes], tmp_path: Path) -> N
 
 @pytest.mark.parametrize("losses", [1, BATCHES + 1, 2 * BATCHES])
 def test_interrupted_in_training(
-    unbroken: dict[str, bytes], losses: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    unbroken: dict[str, bytes], losses: int, tmp_path: Path, interrupted: Callable[..., Any]
 ) -> None:
     """In the first epoch, just after its save point, and at the last batch."""
-    forward, calls = TrustLoss.forward, 0
-
-    def dies(self: nn.Module, tensordict: Any) -> TensorDict:
-        nonlocal calls
-        calls += 1
-        if calls == losses:
-            raise KeyboardInterrupt
-        return forward(self, tensordict)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(TrustLoss, "forward", dies)
-        with pytest.raises(KeyboardInterrupt):
-            runs.start("trust", SMALL, tmp_path / "run", quiet)
+    with interrupted(TrustLoss, "forward", losses):
+        runs.start("trust", SMALL, tmp_path / "run", quiet)
     assert (tmp_path / "run/state.safetensors").exists() == (losses > BATCHES)
     assert not (tmp_path / "run/trust.safetensors").exists()
     runs.resume(tmp_path / "run", quiet)
