@@ -36,16 +36,19 @@ class SwarmBelief(TensorClass):
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a step has to find positions from: everybody's ``place`` by dead reckoning or fix (m),
-    its ``variance`` (m² per axis) and what the step ``added`` to it, who is ``fixed``, the
-    ``links``, and the ``model`` of their errors."""
+    """What a step has to find positions from: everybody's dead-reckoned ``state``, its ``place`` by
+    dead reckoning or fix (m), that place's ``variance`` (m² per axis) and what the step ``added``
+    to it, who is ``fixed``, the ``links``, the ``model`` of their errors, and by what factor each
+    link's weight is held down from outside (``confidence``, in [0, 1]; None: not at all)."""
 
+    state: Float64[Tensor, "B N S"]
     place: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
     added: Float64[Tensor, "B N"]
     fixed: Bool[Tensor, "B N"]
     links: Links
     model: calibration.ErrorModel
+    confidence: Float64[Tensor, "B N N"] | None = None
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,11 @@ class SwarmFilter(Localizer[SwarmBelief]):
         return variance.new_zeros(*variance.shape, self.process.dim, 0)
 
     def step(self, belief: SwarmBelief, observation: Observation) -> tuple[SwarmBelief, Estimate]:
+        now = self.prepared(belief, observation)
+        return self.concluded(belief, now, self.find(belief, now))
+
+    def prepared(self, belief: SwarmBelief, observation: Observation) -> Prepared:
+        """What a step has to find positions from."""
         d, dt = self.process.dim, elapsed(self.process, belief.step).double()
         u = self.process.inputs(observation)
         state = self.process.propagate(belief.state, u, dt)
@@ -110,16 +118,22 @@ class SwarmFilter(Localizer[SwarmBelief]):
         variance = torch.where(fixed, spread, belief.variance + added)
         links = links_of(observation)
         model = self._learned(belief, links, place, fixed)
-        found = self.find(belief, Prepared(place, variance, added, fixed, links, model))
-        state = torch.cat((found.position, state[..., d:]), -1)
+        return Prepared(state, place, variance, added, fixed, links, model)
+
+    def concluded(
+        self, belief: SwarmBelief, now: Prepared, found: Found
+    ) -> tuple[SwarmBelief, Estimate]:
+        """The belief that goes on from what was found, and the estimate."""
+        d, shape = self.process.dim, now.fixed.shape
+        state = torch.cat((found.position, now.state[..., d:]), -1)
         after = build(
             SwarmBelief,
-            fixed.shape,
+            shape,
             state=state,
             variance=found.variance,
             joint=belief.joint if found.joint is None else found.joint,
             step=belief.step + 1,
-            errors=model.sums.unsqueeze(1).expand_as(belief.errors).contiguous(),
+            errors=now.model.sums.unsqueeze(1).expand_as(belief.errors).contiguous(),
         )
         eye = torch.eye(d, dtype=state.dtype, device=state.device)
         covariance = found.variance[..., None, None] * eye
@@ -127,7 +141,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             covariance = own_blocks(found.joint)
         estimate = build(
             Estimate,
-            fixed.shape,
+            shape,
             position=found.position,
             velocity=state[..., d : 2 * d],
             covariance=covariance,
@@ -154,6 +168,12 @@ class SwarmFilter(Localizer[SwarmBelief]):
         self, residual: Float64[Tensor, "B N N"], now: Prepared
     ) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
         """The same for residuals (m)."""
+        weight, shift = self._weighed(residual, now)
+        return (weight if now.confidence is None else now.confidence * weight), shift
+
+    def _weighed(
+        self, residual: Float64[Tensor, "B N N"], now: Prepared
+    ) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
         mask, std = now.links.mask, self.std
         if self.confidence == "none":
             return weights.plain(residual, mask, std)
