@@ -12,10 +12,12 @@ from coloc_env.motion.formation import FormationChange
 from coloc_env.motion.kidnapped import Kidnapped
 from coloc_env.motion.lanes import Line, Square
 from coloc_env.motion.random_circles import RandomCircles
+from coloc_env.motion.random_helices import RandomHelices
 from coloc_env.motion.random_velocity import RandomVelocity
 from coloc_env.motion.recorded import Recorded
 from coloc_env.motion.stop_and_go import StopAndGo
 from coloc_env.motion.waypoints import Waypoints
+from coloc_env.motion.weave import Weave
 
 MOTIONS: dict[str, Motion] = {
     "circle": Circle(),
@@ -46,9 +48,11 @@ __all__ = [
     "Line",
     "Motion",
     "RandomCircles",
+    "RandomHelices",
     "RandomVelocity",
     "Recorded",
     "Square",
     "StopAndGo",
     "Waypoints",
+    "Weave",
 ]

@@ -12,6 +12,8 @@ from coloc_env.motion.fit import altitude, at_most, half_extents, only_3d, posit
 from coloc_env.motion.frames import level_flight, unit
 from coloc_env.motion.timing import StopAndGoLaw, alternating, seconds
 
+Pair = tuple[Tensor, Tensor]
+
 
 @dataclass(frozen=True)
 class Circle(Motion):
@@ -140,16 +142,15 @@ class FigureEight(Motion):
         a = self._half_length(arena)
         rate = self.max_speed / (a * math.sqrt(2))
         phase = rate * seconds(steps, arena.dt) + carry["phase"].unsqueeze(1)
-        cosine, sine = phase.cos(), phase.sin()
-        double = 1 - 2 * sine * sine  # cos 2θ: with cos θ the tangent, which never vanishes
+        (x, y), level, ahead = lemniscate(phase, rate, a)
         height = altitude(self, arena, self.height, self.height_amplitude)
         position = (
-            arena.centre[0] + a * sine,
-            arena.centre[1] + a * sine * cosine,
-            height + self.height_amplitude * cosine,
+            arena.centre[0] + x,
+            arena.centre[1] + y,
+            height + self.height_amplitude * phase.cos(),
         )
-        velocity = (rate * a * cosine, rate * a * double, -rate * self.height_amplitude * sine)
-        return level_flight(position, velocity, unit(cosine, double), arena.dim), carry
+        velocity = (*level, -rate * self.height_amplitude * phase.sin())
+        return level_flight(position, velocity, ahead, arena.dim), carry
 
     def _longest(self, arena: Arena) -> float:
         x, y = half_extents(self, arena, self.margin)[:2]
@@ -157,3 +158,17 @@ class FigureEight(Motion):
 
     def _half_length(self, arena: Arena) -> float:
         return self._longest(arena) if self.half_length is None else self.half_length
+
+
+def lemniscate(
+    phase: Float64[Tensor, "R K N"], rate: float | Tensor, a: float | Tensor
+) -> tuple[Pair, Pair, Pair]:
+    """Position (m) and velocity (m/s) on Gerono's lemniscate about the origin, and the tangent.
+
+    From the angle θ (rad), its rate (rad/s) and the half-length a (m); the unit tangent is that of
+    growing θ.
+    """
+    cosine, sine = phase.cos(), phase.sin()
+    double = 1 - 2 * sine * sine  # cos 2θ: with cos θ the tangent, which never vanishes
+    position = a * sine, a * sine * cosine
+    return position, (rate * a * cosine, rate * a * double), unit(cosine, double)

@@ -51,3 +51,10 @@ def phases(keys: Int64[Tensor, "R"], n_uavs: int, parts: int) -> Float64[Tensor,
     """Fraction i / parts of a cycle for UAV i: how a team is spread along one path."""
     share = torch.arange(n_uavs, device=keys.device, dtype=torch.float64) / parts
     return share.repeat(len(keys), 1)
+
+
+def between(
+    u: Float64[Tensor, "*s"], low: float | Tensor, high: float | Tensor
+) -> Float64[Tensor, "*s"]:
+    """Numbers between two limits from numbers in (0, 1)."""
+    return low + (high - low) * u

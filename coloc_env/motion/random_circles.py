@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.motion.draws import uav_keys, uniform
-from coloc_env.motion.fit import at_most, half_extents, interval
+from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
+from coloc_env.motion.boxes import assigned, of_each, rooms
+from coloc_env.motion.draws import between, uav_keys, uniform
+from coloc_env.motion.fit import at_most, half_extents, inside, interval
 from coloc_env.motion.frames import level_flight
 from coloc_env.motion.timing import seconds
 
@@ -19,31 +20,38 @@ class RandomCircles(Motion):
     """Circles whose centre, radius, direction, phase, height, swing and speed are drawn uniformly.
 
     Drawn per world and UAV, such that the circle keeps a margin from the walls. The height swings
-    once a turn with a phase of its own; yaw along the velocity.
+    once a turn with a phase of its own; yaw along the velocity. ``boxes``: each UAV circles in one
+    of these instead of the whole arena; which one is drawn in proportion to their volumes.
     """
 
     speed: tuple[float, float] = (0.2, 1.0)  # horizontal, m/s
     radius: tuple[float, float] | None = None  # m; None: a quarter to all of what fits
     height_amplitude: tuple[float, float] = (0.0, 0.5)  # m
     margin: float = 0.5  # m kept from the walls
+    boxes: tuple[Box, ...] = ()
 
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
-        halves = half_extents(self, arena, self.margin)
-        u = uniform(uav_keys(keys, arena.n_uavs), "motion.random", 9).unbind(-1)
-        radius = _between(u[0], self._radius(halves, arena))
-        rate = torch.copysign(_between(u[1], interval(self, "speed")) / radius, u[2] - 0.5)
+        inside(self, "boxes", self.boxes, arena)
+        spaces, own = rooms(self.boxes, arena), uav_keys(keys, arena.n_uavs)
+        room = assigned(spaces, own)
+        extents = tuple(half_extents(self, space, self.margin) for space in spaces)
+        centre, halves = of_each(room, (space.centre for space in spaces)), of_each(room, extents)
+        u = uniform(own, "motion.random", 9).unbind(-1)
+        radius = between(u[0], *of_each(room, map(self._radius, extents, spaces)))
+        rate = torch.copysign(between(u[1], *interval(self, "speed")) / radius, u[2] - 0.5)
         drawn = [
-            arena.centre[0] + (halves[0] - radius) * (2 * u[3] - 1),
-            arena.centre[1] + (halves[1] - radius) * (2 * u[4] - 1),
+            centre[0] + (halves[0] - radius) * (2 * u[3] - 1),
+            centre[1] + (halves[1] - radius) * (2 * u[4] - 1),
             radius,
             rate,
             2 * math.pi * u[5],
         ]
         if arena.dim == 3:
             swings = interval(self, "height_amplitude", zero=True)
-            at_most(self, "height_amplitude[1]", swings[1], halves[2], arena)
-            swing, delay = _between(u[6], swings), 2 * math.pi * u[7]
-            drawn.append(arena.centre[2] + (halves[2] - swing) * (2 * u[8] - 1))
+            for extent, space in zip(extents, spaces, strict=True):
+                at_most(self, "height_amplitude[1]", swings[1], extent[2], space)
+            swing, delay = between(u[6], *swings), 2 * math.pi * u[7]
+            drawn.append(centre[2] + (halves[2] - swing) * (2 * u[8] - 1))
             drawn += [swing * delay.cos(), swing * delay.sin()]
         return {"circle": torch.stack(drawn, 1)}
 
@@ -68,7 +76,3 @@ class RandomCircles(Motion):
             return 0.25 * widest, widest
         small, large = interval(self, "radius")
         return small, at_most(self, "radius[1]", large, widest, arena)
-
-
-def _between(u: Tensor, limits: tuple[float, float]) -> Tensor:
-    return limits[0] + (limits[1] - limits[0]) * u

@@ -8,10 +8,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
-from coloc_env.motion.draws import constant, fold_each, uav_keys, uniform
+from coloc_env.motion.boxes import assigned, reflected, rooms, walls
+from coloc_env.motion.draws import fold_each, uav_keys, uniform
 from coloc_env.motion.fit import inside, positive
 from coloc_env.motion.frames import columns, unit, yaw_attitude
-from coloc_env.motion.timing import alternating
 
 _FASTEST = 50.0
 
@@ -21,9 +21,10 @@ class RandomVelocity(Motion):
     """Each UAV's velocity follows a target, speed uniform in [0, v_max], direction uniform.
 
     The target is drawn anew in a step with probability dt / ``interval``; the velocity follows with
-    a first-order lag, integrated exactly. Start positions are uniform in the arena; the velocity
-    starts on its target. The x axis turns towards the horizontal velocity with the same lag, and
-    slower at lower speed, so that it stays where it is at rest.
+    a first-order lag, integrated exactly. With an infinite ``interval`` the first target is kept:
+    straight lines at constant speed, but for the walls. Start positions are uniform in the arena;
+    the velocity starts on its target. The x axis turns towards the horizontal velocity with the
+    same lag, and slower at lower speed, so that it stays where it is at rest.
 
     Walls reflect by unfolding: the motion goes straight on through mirror images of the arena, and
     is folded back, which mirrors position, velocity, target and heading at once, however many walls
@@ -34,21 +35,22 @@ class RandomVelocity(Motion):
     """
 
     v_max: float | None = None  # m/s; None: 50, in small rooms half the shortest side per lag
-    interval: float = 10.0  # s, mean time between targets
+    interval: float = 10.0  # s, mean time between targets; inf: never another
     lag: float = 3.0  # s
     boxes: tuple[Box, ...] = ()
 
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
-        positive(self, "v_max", "interval", "lag")
-        if not arena.dt < min(self.lag, self.interval):
+        positive(self, "v_max", "lag")
+        if not (arena.dt < self.lag and arena.dt < self.interval):
             raise ValueError(
                 f"RandomVelocity: lag = {self.lag:g} s and interval = {self.interval:g} s must be "
                 f"longer than the step of {arena.dt:g} s"
             )
         inside(self, "boxes", self.boxes, arena)
         own = uav_keys(keys, arena.n_uavs)
-        box = self._assigned(own)
-        low, high = self._walls(box, arena)
+        spaces = rooms(self.boxes, arena)
+        box = assigned(spaces, own)
+        low, high = walls(spaces, box)
         velocity = self._targets(uniform(own, "motion.first_target", 3), arena)
         return {
             "keys": own,
@@ -80,28 +82,11 @@ class RandomVelocity(Motion):
             turned = ahead + gain * velocity[..., :2]  # never 0: the gain times v_max is below 1
             x, y = turned.unbind(-1)
             ahead = turned / (x * x + y * y).sqrt().unsqueeze(-1)
-        low, high = (wall.unsqueeze(-3) for wall in self._walls(carry["box"], arena))
+        spaces = rooms(self.boxes, arena)
+        low, high = (wall.unsqueeze(-3) for wall in walls(spaces, carry["box"]))
         truth = _folded(low, high, *(torch.stack(each, 1) for each in zip(*path, strict=True)))
         state = {"position": position, "velocity": velocity, "target": target, "ahead": ahead}
         return truth, {"keys": carry["keys"], "box": carry["box"], **state}
-
-    def _assigned(self, keys: Int64[Tensor, "R N"]) -> Int64[Tensor, "R N"]:
-        """The index of each UAV's box; 0 where there is only the arena."""
-        if not self.boxes:
-            return torch.zeros_like(keys)
-        low, high = constant(self.boxes, keys.device).unbind(1)
-        ends = (high - low).prod(-1).cumsum(0)
-        return torch.bucketize(ends[-1] * uniform(keys, "motion.box", 1)[..., 0], ends[:-1])
-
-    def _walls(
-        self, box: Int64[Tensor, "R N"], arena: Arena
-    ) -> tuple[Float64[Tensor, "R N d"], Float64[Tensor, "R N d"]]:
-        """Lowest and highest corner (m) of the box that each UAV flies in."""
-        low, high = constant(self._spaces(arena), box.device).unbind(1)
-        return low[box], high[box]
-
-    def _spaces(self, arena: Arena) -> tuple[Box, ...]:
-        return self.boxes or ((arena.low, arena.high),)
 
     def _targets(self, u: Float64[Tensor, "*s n"], arena: Arena) -> Float64[Tensor, "*s d"]:
         """Target velocities from uniform numbers: speed, azimuth and, in 3-D, sine of elevation."""
@@ -114,7 +99,7 @@ class RandomVelocity(Motion):
         return columns((level * cosine, level * sine, speed * up), speed)
 
     def _v_max(self, arena: Arena) -> float:
-        spaces = (zip(*space, strict=True) for space in self._spaces(arena))
+        spaces = (zip(room.low, room.high, strict=True) for room in rooms(self.boxes, arena))
         shortest = min(high - low for space in spaces for low, high in space)
         return min(_FASTEST, 0.5 * shortest / self.lag) if self.v_max is None else self.v_max
 
@@ -127,11 +112,6 @@ def _folded(
     ahead: Float64[Tensor, "R K N 2"],
 ) -> Kinematics:
     """Fold an unbounded path into its box: every second image of each axis is mirrored."""
-    side = high - low
-    image = ((position - low) / side).floor()
-    within = position - low - image * side
-    sense = alternating(image)
-    place = torch.where(sense > 0, low + within, high - within)
+    place, sense = reflected(low, high, position)
     x, y = (sense[..., :2] * ahead).unbind(-1)
-    attitude = yaw_attitude(x, y, position.shape[-1])
-    return Kinematics(torch.clamp(place, low, high), sense * velocity, attitude)
+    return Kinematics(place, sense * velocity, yaw_attitude(x, y, position.shape[-1]))

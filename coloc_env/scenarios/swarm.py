@@ -3,10 +3,11 @@ section 5)."""
 
 from typing import Literal
 
-from coloc_env.motion import Arena, Box, RandomVelocity
+from coloc_env.motion import Arena, Box
 from coloc_env.network import Network
 from coloc_env.scenario import InsDriven, Prior, Scenario
 from coloc_env.scenarios.registry import register
+from coloc_env.scenarios.swarm_motions import SwarmMotion, swarm_motion
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging, Sensor
 
 _ARM = 0.3  # width of the arms of a U or an O, of the side
@@ -18,6 +19,7 @@ def swarm(
     n_uavs: int = 200,
     size: tuple[float, float, float] = (10_000.0, 10_000.0, 5_000.0),
     layout: Literal["random", "u", "o"] = "random",
+    motion: SwarmMotion = "random",
     v_max: float = 50.0,
     dt: float = 1.0,
     horizon: int = 100,
@@ -47,7 +49,9 @@ def swarm(
 
     ``anchors``: share of the UAVs that know where they are, to ``anchor_std`` m per axis; they are
     not scored. ``layout``: where UAVs fly, the whole box, or the arms of a ``u`` or an ``o`` around
-    a hole. ``nlos``: share of ranges with a bias of ``nlos_bias`` m, every step anew or over
+    a hole. ``motion``: target velocities drawn anew (``random``), a ``line``, level ``circle`` or
+    ``helix`` for each UAV, or a ``weave`` of ten through one point, each at speeds up to ``v_max``
+    m/s. ``nlos``: share of ranges with a bias of ``nlos_bias`` m, every step anew or over
     ``nlos_time`` s; ``uwb_tail``: share with ``uwb_tail_std`` m of noise. ``link_failure``:
     probability that a link is broken in a step; ``failure_rate``: that a UAV fails in an episode.
     The team believes the Gaussian part of the ranges, and the INS as it is.
@@ -58,7 +62,7 @@ def swarm(
         raise ValueError(f"n_uavs={n_uavs} is not allowed: at least one UAV")
     if not 0 <= anchors < 1:
         raise ValueError(f"anchors={anchors} is not allowed: a share in [0, 1)")
-    guides = round(anchors * n_uavs)
+    guides, boxes = round(anchors * n_uavs), _boxes(layout, size)
     error = RangeNoise(
         std=uwb_std,
         nlos=nlos,
@@ -76,7 +80,7 @@ def swarm(
         name="swarm-v0",
         arena=Arena(3, n_uavs, dt, (0.0, 0.0, 0.0), size),
         horizon=horizon,
-        motion=RandomVelocity(v_max, boxes=_boxes(layout, size)),
+        motion=swarm_motion(motion, v_max, boxes, size),
         sensors=(*own, Ranging(error)),
         network=Network(
             comm_radius,

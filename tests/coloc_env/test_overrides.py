@@ -77,6 +77,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "n_uavs": 7,
         "size": (9e3, 8e3, 4e3),
         "layout": "o",
+        "motion": "weave",
         "v_max": 100.0,
         "dt": 0.5,
         "horizon": 17,

@@ -10,8 +10,10 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from torch import Tensor
 from torchrl.envs import check_env_specs
 
+from coloc_env import noise
 from coloc_env.batched import CoLocEnv
 from coloc_env.bounds import posterior_bound
+from coloc_env.motion import Kinematics
 from coloc_env.observation import action_bounds, all_leaves
 from coloc_env.parallel import CoLocParallelEnv, parallel_env
 from coloc_env.scenario import REWARDS, InsDriven
@@ -19,6 +21,7 @@ from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging
 from coloc_env.world import World
 
+MOTIONS = ["random", "line", "circle", "helix", "weave"]
 TROUBLE: dict[str, Any] = {
     "n_uavs": 10,
     "anchors": 0.3,
@@ -123,6 +126,81 @@ def test_layouts(layout: str) -> None:
         )
 
 
+# ---------------------------------------------------------------- motions
+
+
+def paths(motion: str, seeds: list[int], steps: int = 101, **overrides: Any) -> Kinematics:
+    scenario = make_scenario("swarm-v0", motion=motion, **overrides)
+    carry = scenario.motion.start(noise.row_keys(torch.tensor(seeds)), scenario.arena)
+    each = torch.arange(steps).expand(len(seeds), -1)
+    return scenario.motion.advance(carry, each, scenario.arena)[0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("layout", ["random", "u", "o"])
+@pytest.mark.parametrize("v_max", [5.0, 50.0, 100.0])
+def test_motions_keep_to_their_layout_and_speed(motion: str, layout: str, v_max: float) -> None:
+    truth = paths(motion, [0, 1], 400, layout=layout, v_max=v_max)
+    size = torch.tensor([10e3, 10e3, 5e3], dtype=torch.float64)
+    share = (truth.position / size).flatten(0, 2)
+    assert ((share >= 0) & (share <= 1)).all()
+    x, y = share[:, 0], share[:, 1]
+    hole = (x > 0.3) & (x < 0.7) & (y > 0.3) & ((y < 0.7) | (layout == "u"))
+    assert bool(hole.any()) == (layout == "random")
+    speed = truth.velocity.norm(dim=-1)
+    assert 0.95 * v_max < speed.max() <= v_max
+
+
+@pytest.mark.parametrize("v_max", [10.0, 50.0, 80.0])
+@pytest.mark.parametrize("motion", ["circle", "helix", "weave"])
+def test_turns_are_plausible(motion: str, v_max: float) -> None:
+    """At most 15 m/s², of which much is used at high speed; velocities are exact at fine steps."""
+    dt = 0.01
+    truth = paths(motion, [2], 2001, v_max=v_max, dt=dt)
+    middle = (truth.position[:, 2:] - truth.position[:, :-2]) / (2 * dt)
+    force = (truth.velocity[:, 2:] - truth.velocity[:, :-2]).norm(dim=-1) / (2 * dt)
+    free = truth.velocity.diff(dim=1)[..., 2].abs() < 0.02 * v_max
+    free = free[:, 1:] & free[:, :-1]  # a helix is reflected at floor and ceiling
+    assert free.double().mean() > 0.99
+    assert force[free].max() <= 15.0
+    assert force[free].max() > (9.0 if v_max >= 50 else 0.5)
+    torch.testing.assert_close(middle[free], truth.velocity[:, 1:-1][free], rtol=0, atol=1e-3)
+
+
+def test_lines_are_straight() -> None:
+    velocity = paths("line", [0, 1]).velocity
+    assert torch.equal(velocity.abs(), velocity[:, :1].abs().expand_as(velocity))
+
+
+def test_a_weave_is_dense_and_the_other_motions_are_not() -> None:
+    """A UAV comes within 100 m of most of its group of ten in 100 s, and again and again."""
+    met, again, nearest = {}, {}, {}
+    for motion in MOTIONS:
+        position = paths(motion, [0]).position
+        i, j = torch.triu_indices(200, 200, 1)
+        apart = (position[:, :, i] - position[:, :, j]).norm(dim=-1)
+        close = apart < 100.0
+        met[motion] = float(close.any(1).sum() * 2 / 200)  # others met by a UAV
+        begun = close[:, 1:] & ~close[:, :-1]
+        again[motion] = float(begun.sum() * 2 / 200)  # encounters of a UAV in 100 s
+        far = torch.full((200,), math.inf, dtype=torch.float64).diag()
+        nearest[motion] = float((torch.cdist(position, position) + far).amin(-1).median())
+    assert met["weave"] > 7.0
+    assert again["weave"] > 15.0
+    assert nearest["weave"] < 120.0
+    for motion in MOTIONS[:-1]:
+        assert met[motion] < 0.3
+        assert again[motion] < 0.3
+        assert nearest[motion] > 500.0
+
+
+def test_guides_are_spread_over_the_groups_of_a_weave() -> None:
+    position = paths("weave", [4]).position[0]
+    first = position[:, :20].mean(0)  # one UAV of each group of ten
+    reach = (position.mean(0).unsqueeze(1) - first).norm(dim=-1).argmin(-1)
+    assert torch.equal(reach[:30], torch.arange(30) % 20)
+
+
 # ---------------------------------------------------------------- guides
 
 
@@ -175,6 +253,16 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
         ({"size": (1e3, 1e3, 0.0)}, r"dt \(s\) and the sides of size \(m\) must be > 0"),
         ({"size": (1e3, 1e3)}, "size=.* is not allowed: 3 numbers"),
         ({"layout": "w"}, "layout='w' is not allowed: one of random, u, o"),
+        ({"motion": "zigzag"}, "motion='zigzag' .*: one of random, line, circle, helix, weave"),
+        ({"v_max": 0.0}, "v_max=0.0 is not allowed: a speed in m/s > 0"),
+        (
+            {"motion": "circle", "v_max": 150.0, "layout": "u"},
+            r"v_max=150.0 is not allowed with motion='circle': .* 1500 m .* room for 1499.5 m",
+        ),
+        (
+            {"motion": "weave", "size": (300.0, 150.0, 100.0)},
+            "v_max=50.0 is not allowed with motion='weave': .* 177.083 m .* room for 74.5 m",
+        ),
         ({"anchors": 1.0}, r"anchors=1.0 is not allowed: a share in \[0, 1\)"),
         ({"anchors": -0.1}, r"anchors=-0.1 is not allowed: a share in \[0, 1\)"),
         ({"anchors": 0.9, "n_uavs": 3}, "guides=3 is not allowed: from 0 to fewer than the 3"),
@@ -197,11 +285,6 @@ def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_a_speed_that_makes_no_sense_is_named_when_the_world_starts() -> None:
-    with pytest.raises(ValueError, match=r"v_max must be positive, not 0\.0"):
-        World(make_scenario("swarm-v0", v_max=0.0)).reset(0)
-
-
 # ---------------------------------------------------------------- faces and seeds
 
 
@@ -212,7 +295,12 @@ def truth(env: CoLocParallelEnv) -> dict[str, np.ndarray]:
     return {a: np.concatenate((rows[env.possible_agents.index(a)][:6], surely)) for a in env.agents}
 
 
-@pytest.mark.parametrize("overrides", [{"n_uavs": 5}, TROUBLE], ids=["plain", "trouble"])
+WOVEN = {**TROUBLE, "motion": "weave"}
+
+
+@pytest.mark.parametrize(
+    "overrides", [{"n_uavs": 5}, TROUBLE, WOVEN], ids=["plain", "trouble", "woven"]
+)
 def test_both_faces_work(overrides: dict[str, Any]) -> None:
     parallel_api_test(parallel_env("swarm-v0", horizon=12, **overrides), num_cycles=30)
     parallel_seed_test(lambda: parallel_env("swarm-v0", horizon=12, **overrides))
@@ -231,11 +319,12 @@ def test_the_truth_as_an_action_costs_nothing_over_the_whole_path() -> None:
     assert all(info["episode_max"] == 0 for info in infos.values())
 
 
-def test_a_row_of_a_batch_is_its_own_world_whatever_the_window() -> None:
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(motion: str) -> None:
     seeds = [5, 0, 9, 2**40, 7]
-    together = flown(90, seeds, **TROUBLE)
+    together = flown(90, seeds, motion=motion, **TROUBLE)
     for row, window in ((0, 1), (3, 7), (4, 64)):
-        alone = flown(90, seeds[row : row + 1], window, **TROUBLE)
+        alone = flown(90, seeds[row : row + 1], window, motion=motion, **TROUBLE)
         assert torch.equal(alone, together[:, row : row + 1])
 
 

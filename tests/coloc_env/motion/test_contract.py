@@ -8,26 +8,42 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from coloc_env.geometry import rotation_between, rotation_matrix
-from coloc_env.motion import MOTIONS, Circle, RandomVelocity, Square, Waypoints
+from coloc_env.motion import (
+    MOTIONS,
+    Circle,
+    RandomCircles,
+    RandomHelices,
+    RandomVelocity,
+    Square,
+    Waypoints,
+    Weave,
+)
 
 ROOM = (30.0, 20.0, 5.0)
 ROUTE = Waypoints(route=((2.0, 2.0, 1.0), (9.0, 3.0, 2.0), (9.0, 3.0, 4.0), (5.0, 8.0, 1.5)))
 SHARP = Square(sharp=True)
-BOXES = RandomVelocity(
-    boxes=(((0.0, 0.0, 0.0), (8.0, 20.0, 5.0)), ((20.0, 5.0, 1.0), (30.0, 9.0, 5.0)))
-)
+TWO = (((0.0, 0.0, 0.0), (8.0, 20.0, 5.0)), ((20.0, 5.0, 1.0), (30.0, 9.0, 5.0)))
+CORNERS = torch.tensor(TWO, dtype=torch.float64)
 ALL = {
     **MOTIONS,
     "route": ROUTE,
     "sharp": SHARP,
     "fast_swarm": RandomVelocity(v_max=50.0),
-    "boxes": BOXES,
+    "boxes": RandomVelocity(boxes=TWO),
+    "lines": RandomVelocity(interval=math.inf),
+    "circles_in_boxes": RandomCircles(boxes=TWO),
+    "helices": RandomHelices(),
+    "helices_in_boxes": RandomHelices(RandomCircles(boxes=TWO), climb=(0.5, 2.0)),
+    "weave": Weave(group=3),
+    "weave_in_boxes": Weave(group=2, boxes=TWO),
 }
-JUMPY = {"sharp", "random_velocity", "fast_swarm", "boxes"}  # velocity jumps at corners or walls
+# Velocity jumps at corners or walls.
+JUMPY = {"sharp", "random_velocity", "fast_swarm", "boxes", "lines", "helices", "helices_in_boxes"}
 SMOOTH = [name for name in ALL if name not in JUMPY]
 LEVEL = [name for name in ALL if name != "aggressive"]
 ALIGNED = [name for name in SMOOTH if name not in {"aggressive", "formation"}]
-FLAT = [name for name in ALL if name not in {"helix", "route", "boxes"}]  # those that fly in 2-D
+UPRIGHT = {"helix", "route", "helices"}  # never fly in 2-D
+FLAT = [name for name in ALL if name not in UPRIGHT and not name.endswith("boxes")]
 EVERYWHERE = [name for name in MOTIONS if name != "circle"]  # fit any room as they are
 
 
@@ -182,7 +198,28 @@ def test_ten_kilometres(name, fly, arena):
     assert truth.velocity.norm(dim=-1).max() <= 50.0
 
 
-@pytest.mark.parametrize("name", ["random", "waypoints", "aggressive", "random_velocity"])
+@pytest.mark.parametrize("name", ["helices", "helices_in_boxes"])
+def test_helices_need_three_dimensions(name, fly, arena):
+    with pytest.raises(ValueError, match="RandomHelices needs an arena of 3 dimensions, not 2"):
+        fly(ALL[name], arena(*ROOM[:2]), [0], 1)
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if name.endswith("in_boxes")])
+def test_each_uav_keeps_to_a_box_of_its_own(name, fly, arena):
+    """And every box has its share of them."""
+    position = fly(ALL[name], arena(*ROOM), list(range(60)), 3000).position
+    within = [((position >= low) & (position <= high)).all(-1).all(1) for low, high in CORNERS]
+    assert (within[0] ^ within[1]).all()
+    groups = position.shape[2] // 2 if name == "weave_in_boxes" else position.shape[2]
+    sides = (CORNERS[:, 1] - CORNERS[:, 0]).prod(-1)
+    share = float(sides[0] / sides.sum())
+    spread = 5 * math.sqrt(share * (1 - share) / (60 * groups))
+    assert within[0].double().mean() == pytest.approx(share, abs=spread)
+
+
+@pytest.mark.parametrize(
+    "name", ["random", "waypoints", "aggressive", "random_velocity", "lines", "helices", "weave"]
+)
 def test_worlds_and_uavs_fly_different_paths(name, fly, arena):
-    position = fly(MOTIONS[name], arena(*ROOM), list(range(40)), 1).position[:, 0].flatten(0, 1)
+    position = fly(ALL[name], arena(*ROOM), list(range(40)), 1).position[:, 0].flatten(0, 1)
     assert len(position.unique(dim=0)) == 240

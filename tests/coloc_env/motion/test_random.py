@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from coloc_env.geometry import rotation_matrix
-from coloc_env.motion import Aggressive, RandomCircles, RandomVelocity, Waypoints
+from coloc_env.motion import (
+    Aggressive,
+    RandomCircles,
+    RandomHelices,
+    RandomVelocity,
+    Waypoints,
+    Weave,
+)
 from coloc_env.motion.aggressive import _BASIS, PEAKS
 from coloc_env.motion.frames import GRAVITY, heading
 
@@ -122,6 +129,84 @@ def test_walls_reflect(fly, arena):
     speed = truth.velocity.abs()
     torch.testing.assert_close(speed, speed[:, :1].expand_as(speed))  # only signs ever change
     assert (truth.velocity[:, 1:] * truth.velocity[:, :-1] < 0).any(1).all()
+
+
+def test_an_infinite_interval_makes_straight_lines(fly, arena):
+    truth = fly(RandomVelocity(v_max=8.0, interval=math.inf), arena(*ROOM), SEEDS, 400)
+    speed = truth.velocity.abs()
+    assert torch.equal(speed, speed[:, :1].expand_as(speed))  # walls change signs, nothing else
+    assert (truth.velocity.sign().diff(dim=1) != 0).any()
+    total = truth.velocity[:, 0].norm(dim=-1).flatten()
+    assert total.max() <= 8.0
+    assert total.mean() == pytest.approx(4.0, abs=5 * 8 / math.sqrt(12 * 300))  # uniform
+
+
+def test_helices_are_circles_that_climb_between_floor_and_ceiling(fly, arena):
+    motion = RandomHelices(RandomCircles(height_amplitude=(0.0, 0.0), margin=0.7), climb=(0.2, 0.6))
+    truth = fly(motion, arena(*ROOM), SEEDS, 1000)
+    level = fly(motion.circles, arena(*ROOM), SEEDS, 1000)
+    assert torch.equal(truth.position[..., :2], level.position[..., :2])
+    rate = truth.velocity[..., 2]
+    # A triangle wave from the closed form of its unfolded path.
+    rise, height = ROOM[2] - 1.4, level.position[:, :1, :, 2] - 0.7
+    path = height + rate[:, :1] * 0.1 * torch.arange(1000).view(1, -1, 1)
+    wave = rise - (path.remainder(2 * rise) - rise).abs()
+    torch.testing.assert_close(truth.position[..., 2] - 0.7, wave, rtol=0, atol=1e-9)
+    assert 0.2 <= rate.abs().min() < 0.21
+    assert 0.59 < rate.abs().max() <= 0.6
+    assert 0.35 < (rate[:, 0] > 0).double().mean() < 0.65
+    assert (rate.sign().diff(dim=1) != 0).any(1).all()
+
+
+def test_a_weave_crosses_at_the_centres_of_its_groups(fly, arena):
+    """At drawn speeds, on curves of drawn size."""
+    speeds, lengths, swings = (1.0, 2.0), (3.0, 4.0), (0.2, 1.0)
+    motion = Weave(speeds, lengths, swings, group=5)
+    room = arena(60.0, 50.0, 8.0, n=14, dt=0.02)
+    truth = fly(motion, room, SEEDS[:6], 3000)
+    groups = torch.arange(14) % 3
+    low, high = truth.position.amin(1), truth.position.amax(1)
+    middle, half = (low + high) / 2, (high - low) / 2  # a figure of eight is symmetric
+    for group in range(3):
+        centre = middle[:, groups == group]
+        torch.testing.assert_close(centre, centre[:, :1].expand_as(centre), rtol=0, atol=1e-3)
+    between = middle[:, 1:3] - middle[:, :2]
+    assert (between.norm(dim=-1) > 1.0).all()
+    across = (truth.position - middle.unsqueeze(1))[..., :2].norm(dim=-1)
+    assert (across.amin(1) < 0.05).all()  # all pass the centre
+    reach = across.amax(1)
+    assert 3.0 - 1e-3 <= reach.min() < 3.1
+    assert 3.9 < reach.max() <= 4.0
+    assert 0.2 - 1e-3 <= half[..., 2].min() < 0.3
+    assert 0.9 < half[..., 2].max() <= 1.0
+    assert truth.velocity.norm(dim=-1).max() <= 2.0
+    assert truth.velocity.norm(dim=-1).amax(1).min() > 0.9
+    acceleration = (truth.velocity.diff(dim=1) / 0.02).norm(dim=-1)
+    assert acceleration.max() <= 17 / 16 * 4.0 / 3.0
+
+
+def test_the_acceleration_of_a_figure_of_eight_is_what_weave_says(fly, arena):
+    motion = Weave((2.0, 2.0), (3.0, 3.0), (0.0, 0.0), group=2)
+    truth = fly(motion, arena(*ROOM, dt=1e-3), [0, 1], 20_000)
+    acceleration = (truth.velocity.diff(dim=1) / 1e-3).norm(dim=-1)
+    assert float(acceleration.max()) == pytest.approx(17 / 16 * 4 / 3, rel=1e-4)
+    assert float(truth.velocity.norm(dim=-1).max()) == pytest.approx(2.0, rel=1e-6)
+
+
+def test_half_of_a_weaving_group_flies_backwards(fly, arena):
+    """On the lobe that a figure of eight's own axis points to, the turn tells the sense."""
+    motion = Weave((1.0, 1.0), (3.0, 3.0), (0.0, 0.0), group=4)
+    room = arena(*ROOM, n=8)
+    carry = motion.start(torch.arange(5), room)
+    truth, _ = motion.advance(carry, torch.arange(400).expand(5, -1), room)
+    axis = carry["curve"][:, 3:5].transpose(1, 2).unsqueeze(1)
+    away = truth.position[..., :2] - carry["centre"][:, :2].transpose(1, 2).unsqueeze(1)
+    right = (away * axis).sum(-1) > 1.5  # well inside the lobe
+    before, after = truth.velocity[:, :-1, :, :2], truth.velocity[:, 1:, :, :2]
+    turn = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    clockwise = turn < 0
+    expected = (torch.arange(8) // 2 % 2 == 0).expand_as(turn)
+    assert torch.equal(clockwise[right[:, :-1]], expected[right[:, :-1]])
 
 
 def test_each_uav_keeps_to_its_box(fly, arena):

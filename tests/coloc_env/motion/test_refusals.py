@@ -10,10 +10,12 @@ from coloc_env.motion import (
     Helix,
     Line,
     RandomCircles,
+    RandomHelices,
     RandomVelocity,
     Square,
     StopAndGo,
     Waypoints,
+    Weave,
 )
 
 SMALL = (4.0, 4.0, 2.5)
@@ -35,6 +37,17 @@ REFUSED = [
     (RandomCircles(radius=(1.0, 2.0)), r"RandomCircles: radius\[1\] = 2 .* at most 1.5"),
     (RandomCircles(speed=(0.0, 1.0)), r"RandomCircles: speed must be .* above 0, not \(0.0, 1.0\)"),
     (RandomCircles(height_amplitude=(0.5, 0.1)), "height_amplitude must be .* from 0 on"),
+    (RandomCircles(boxes=(((0.0, 0.0), (1.0, 1.0)),)), "RandomCircles: boxes: .* is no box"),
+    (
+        RandomCircles(radius=(0.5, 1.0), boxes=(((0.0, 0.0, 0.0), (4.0, 2.0, 2.5)),)),
+        r"RandomCircles: radius\[1\] = 1 .* 4 × 2 × 2.5 m: at most 0.5",
+    ),
+    (RandomHelices(climb=(0.0, 1.0)), r"RandomHelices: climb must be .* above 0, not \(0.0, 1.0\)"),
+    (Weave(group=0), "Weave: group must be at least one UAV, not 0"),
+    (Weave(half_length=(1.0, 2.0)), r"Weave: half_length\[1\] = 2 .* at most 1.5"),
+    (Weave(height_amplitude=(0.0, 1.0)), r"Weave: height_amplitude\[1\] = 1 .* at most 0.75"),
+    (Weave(speed=(2.0, 1.0)), r"Weave: speed must be .* above 0, not \(2.0, 1.0\)"),
+    (Weave(boxes=(((0.0, 2.0, 0.0), (1.0, 2.0, 1.0)),)), "Weave: boxes: .* is no box"),
     (
         Waypoints(duration=1.0),
         "Waypoints: duration = 1 s exceeds max_speed = 3 m/s .* at least 2.8",
@@ -63,6 +76,8 @@ REFUSED = [
     ),
     (RandomVelocity(boxes=(((0.0, 0.0), (1.0, 1.0)),)), "is no box"),
     (RandomVelocity(boxes=(((0.0, 2.0, 0.0), (1.0, 2.0, 1.0)),)), "is no box"),
+    (RandomVelocity(interval=-1.0), "interval = -1 s must be longer than the step"),
+    (RandomVelocity(interval=float("nan")), "interval = nan s must be longer than the step"),
     (RandomVelocity(lag=0.05), "RandomVelocity: lag = 0.05 s .* longer than the step of 0.1 s"),
 ]
 
