@@ -139,7 +139,7 @@ class LocalizerPolicy(TensorDictModuleBase):
         observation = Observation({name: seen[name] for name in self._leaves})
         belief = self._belief
         if self.carry == "tensordict":
-            belief = _restored(self._template, tensordict["belief"], observation.batch_size)
+            belief = restored(self._template, tensordict["belief"], observation.batch_size)
         belief = self._start(belief, observation, begins.flatten())
         after, estimate = self.localizer.step(belief, observation)
         tensordict["uav", "action"] = estimate.action()
@@ -147,7 +147,7 @@ class LocalizerPolicy(TensorDictModuleBase):
             for name, value in self.record(belief, after, tensordict).items():
                 tensordict["train", name] = value
         if self.carry == "tensordict":
-            tensordict["next", "belief"] = _flat(after)
+            tensordict["next", "belief"] = flat(after)
         else:
             self._belief = after
         return tensordict
@@ -168,23 +168,24 @@ class LocalizerPolicy(TensorDictModuleBase):
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that makes room in tensordicts for what the policy carries there."""
         carried = self.carry == "tensordict"
-        entries = {"belief": _spec(_flat(self._template))} if carried else {}
+        entries = {"belief": _spec(flat(self._template))} if carried else {}
         return TensorDictPrimer(entries, expand_specs=True)
 
 
-def _flat(belief: Any) -> TensorDict:
+def flat(belief: Any) -> TensorDict:
     """A belief's entries, nested names joined by dots, with a batch size of worlds alone (so that
     the primer's zeros and the policy's beliefs have one shape)."""
     entries = belief.to_tensordict(retain_none=False).flatten_keys(".")
     return TensorDict(dict(entries.items()), batch_size=belief.batch_size[:1])
 
 
-def _restored(template: Any, entries: TensorDictBase, batch_size: torch.Size) -> Any:
-    """Entries of ``_flat`` as the tensorclass of ``template``, nested ones included."""
+def restored(template: Any, entries: TensorDictBase, batch_size: torch.Size) -> Any:
+    """A belief from what a policy that carries it in tensordicts has written there: ``entries`` as
+    the tensorclass of ``template``, nested ones included."""
     values = {
         name: value
         if isinstance(value, Tensor)
-        else _restored(getattr(template, name), value, batch_size)
+        else restored(getattr(template, name), value, batch_size)
         for name, value in entries.unflatten_keys(".").items()
     }
     return type(template)(**values, batch_size=batch_size)

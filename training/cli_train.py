@@ -68,6 +68,7 @@ def train(
     from training import pfnn as _pfnn  # noqa: F401
     from training import runs
     from training import sb3_ppo as _sb3_ppo  # noqa: F401
+    from training import stdcl as _stdcl  # noqa: F401
     from training import trust as _trust  # noqa: F401
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer it makes
