@@ -43,15 +43,15 @@ def drawn_from(seed: int) -> Iterator[None]:
         yield
 
 
-def untrained(kind: type[_L], seed: int) -> _L:
+def untrained(kind: type[_L], seed: int, **architecture: Any) -> _L:
     """A neural part with random weights, drawn from ``seed`` and from no shared generator."""
     with drawn_from(seed):
-        return kind()
+        return kind(**architecture)
 
 
-def learned(kind: type[_L], weights: str, seed: int = 0) -> _L:
+def learned(kind: type[_L], weights: str, seed: int = 0, **architecture: Any) -> _L:
     """A neural part with a checkpoint's weights (``load``); untrained for ``none``."""
-    module = untrained(kind, seed)
+    module = untrained(kind, seed, **architecture)
     if weights != "none":
         load(weights, module)
     return module

@@ -1,4 +1,4 @@
-"""ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, Figure 1)."""
+"""ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, figure 1 and Algorithm 2)."""
 
 from dataclasses import replace
 from typing import Literal
@@ -11,17 +11,20 @@ from torch import Tensor
 from agents.checkpoint import learned
 from agents.dwmds import DynamicMds
 from agents.localizer import Estimate, Localizer, register
-from agents.stgnn.features import Memory, Scene, forgotten, look
+from agents.stgnn.features import Memory, Scene, along_links, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
-from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief
+from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
 from agents.swarm.links import lengths
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
 Feedback = Literal["none", "paper", "links", "positions", "learned"]
+_LINKS: tuple[Feedback, ...] = ("paper", "links", "learned")
+_POSITIONS: tuple[Feedback, ...] = ("positions", "learned")
 _RATE = 0.1  # largest change of a link's confidence in a step, as a share
 _LEAST = 0.1  # confidence of a link
+_GAIN = 0.05  # κ of the paper's feedback
 
 
 class LoopBelief(TensorClass):
@@ -34,24 +37,24 @@ class LoopBelief(TensorClass):
     confidence: Float64[Tensor, "B N N"]
 
 
-@register("stdcl")
-class StDcl(Localizer[LoopBelief]):
-    name = "stdcl"
+class NetworkLoop(Localizer[LoopBelief]):
+    """A swarm filter whose positions a graph network corrects, and what is fed back to it.
+
+    ``feedback``: ``positions``, the next step starts from the corrected positions and the variance
+    that the network gives them; ``links``, the weight of each link is held down as far as the
+    network says; ``learned``, both; ``paper``, links are held down by equation 36; ``none``.
+    A link's confidence changes by a tenth a step at most, and is a tenth at least.
+
+    Where gradients are asked for, what is fed back is followed to the next position in first order,
+    neighbours held: ∂y/∂m = λ H⁻¹, ∂y/∂c_ij = H⁻¹ W_ij (d̃_ij − ‖y_i − y_j‖) u_ij / c_ij.
+    """
+
     centralized = True
 
-    def __init__(
-        self,
-        believed: Believed,
-        *,
-        weights: str = "stdcl",
-        feedback: Feedback = "learned",
-        confidence: Confidence = "em",
-        gain: float = 0.05,
-    ) -> None:
-        super().__init__(believed)
-        self.base = DynamicMds(believed, confidence=confidence)
-        self.feedback, self.gain = feedback, gain
-        self.network = learned(StGnn, weights).double().requires_grad_(False)
+    def __init__(self, base: SwarmFilter, network: StGnn, feedback: Feedback) -> None:
+        super().__init__(base.believed)
+        self.base, self.feedback = base, feedback
+        self.network = network.double().requires_grad_(False)
 
     def learn(self, network: StGnn) -> None:
         """Correct by this network from now on."""
@@ -62,75 +65,121 @@ class StDcl(Localizer[LoopBelief]):
         return True
 
     def reset(self, observation: Observation) -> LoopBelief:
-        base = self.base.reset(observation)
+        base, d = self.base.reset(observation), self.base.process.dim
         shape = base.batch_size
-        fixed = torch.zeros(shape, dtype=torch.bool, device=base.step.device)
-        return LoopBelief(
+        return build(
+            LoopBelief,
+            shape,
             base=base,
-            memory=forgotten(fixed, self.base.process.dim),
-            past=self.network.start(shape, self.base.process.dim),
+            memory=forgotten(*shape, d, base.step.device),
+            past=self.network.start(shape, d),
             confidence=base.variance.new_ones(*shape, shape[1]),
-            batch_size=shape,
         )
 
     def step(self, belief: LoopBelief, observation: Observation) -> tuple[LoopBelief, Estimate]:
         with torch.no_grad():
             now = self.base.prepared(belief.base, observation)
-            if self.feedback in ("paper", "links", "learned"):
+            if self.feedback in _LINKS:
                 now = replace(now, confidence=belief.confidence)
             found = self.base.find(belief.base, now)
             weight, shift = self.base.weigh(found.position, now)
             scene, memory = look(now, found, weight, shift, self.base.std, belief.memory)
         correction, past = self.network(scene, belief.past)
-        attached = self.attached(belief, now, found, scene, weight, shift)
-        best = self.corrected(now, found, attached, correction)
-        feeds = self.feedback in ("positions", "learned")
-        kept, _ = self.base.concluded(belief.base, now, best if feeds else found)
-        _, estimate = self.base.concluded(belief.base, now, best)
+        if torch.is_grad_enabled():
+            found = replace(found, position=found.position + _owed(belief, now, scene, shift))
+        best = _corrected(now, found, correction)
+        kept, estimate = self.base.concluded(belief.base, now, best)
+        if self.feedback not in _POSITIONS:
+            kept, _ = self.base.concluded(belief.base, now, found)
         after = build(
             LoopBelief,
             belief.batch_size,
             base=kept,
             memory=memory,
             past=past,
-            confidence=self.fed_back(belief.confidence, now, best, correction),
+            confidence=self._fed_back(belief.confidence, now, best, correction),
         )
         return after, estimate
 
-    def attached(self, belief, now, found, scene, weight, shift):
-        """The position found, with what it owes to what was fed back (first order, neighbours held)."""
-        if not torch.is_grad_enabled():
-            return found.position
-        d = self.base.process.dim
-        m = belief.base.state[..., :d]
-        y = found.position
-        gain = scene.gain.detach()
-        push = scene.trust[..., None] * (m - m.detach())
-        if belief.confidence.requires_grad:
-            from agents.stgnn.features import along_links
-            c = belief.confidence
-            r = now.links.distance - scene.length - shift
-            s = (c - c.detach()) * (weight / c.detach()) * r
-            push = push + along_links(scene.position, s, scene.length)
-        move = (gain @ push.unsqueeze(-1))[..., 0]
-        return y + torch.where(now.fixed.unsqueeze(-1), 0.0, move)
+    def diagnostics(self, belief: LoopBelief) -> dict[str, Float64[Tensor, "B N"]]:
+        return self.base.diagnostics(belief.base)
 
-    def corrected(self, now: Prepared, found: Found, y, correction: Correction) -> Found:
-        """p̂ = p + γ Δp (eq. 34); who is fixed stays."""
-        moves = ~now.fixed
-        position = torch.where(moves.unsqueeze(-1), y + correction.offset.double(), y)
-        spread = correction.spread.double()
-        variance = torch.where(moves, found.variance * spread, found.variance)
-        return Found(position, variance)
-
-    def fed_back(self, old, now, best, correction):
-        if self.feedback not in ("paper", "links", "learned"):
+    def _fed_back(
+        self, old: Float64[Tensor, "B N N"], now: Prepared, best: Found, correction: Correction
+    ) -> Float64[Tensor, "B N N"]:
+        """The links' confidence after a step; that of links that were not there stays."""
+        if self.feedback not in _LINKS:
             return old
+        wanted = correction.confidence.double()
         if self.feedback == "paper":
             off = (now.links.distance - lengths(best.position)).abs() / self.base.std
-            wanted = torch.exp(-self.gain * off)
-        else:
-            wanted = correction.confidence.double()
+            wanted = torch.exp(-_GAIN * off)
         change = (wanted.clamp_min(_LEAST) / old).log()
-        new = old * torch.exp(_RATE * torch.tanh(change / _RATE))
-        return torch.where(now.links.mask, new, old)
+        return torch.where(now.links.mask, old * torch.exp(_RATE * torch.tanh(change / _RATE)), old)
+
+
+def _owed(
+    belief: LoopBelief, now: Prepared, scene: Scene, shift: Float64[Tensor, "B N N"]
+) -> Float64[Tensor, "B N d"]:
+    """Zeros whose gradient is that of the position found by what had been fed back."""
+    start = belief.base.state[..., : scene.position.shape[-1]]
+    push = scene.trust.unsqueeze(-1) * (start - start.detach())
+    before = belief.confidence
+    change = before / before.detach() - 1
+    pull = change * scene.weight * (now.links.distance - scene.length - shift)
+    push = push + along_links(scene.position, pull, scene.length)
+    return torch.where(scene.moves.unsqueeze(-1), (scene.gain @ push.unsqueeze(-1))[..., 0], 0.0)
+
+
+def _corrected(now: Prepared, found: Found, correction: Correction) -> Found:
+    """p̂ = p + γ Δp (eq. 34) and its variance; who is fixed stays."""
+    position = found.position + correction.offset.double()
+    variance = found.variance * correction.spread.double()
+    return Found(
+        torch.where(now.fixed.unsqueeze(-1), found.position, position),
+        torch.where(now.fixed, found.variance, variance),
+    )
+
+
+@register("stdcl")
+class StDcl(NetworkLoop):
+    """ST-DCL whole: ``dwmds_st``, the ST-GNN, and the loop between them.
+
+    ``feedback``: ``learned`` (what the shipped weights were trained with), ``paper`` (equation 36),
+    ``none``, ``links``, ``positions``. ``confidence``: the optimizer's. ``weights``: a checkpoint's
+    name or path, or ``none``.
+    """
+
+    name = "stdcl"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        weights: str = "stdcl",
+        feedback: Feedback = "learned",
+        confidence: Confidence = "em",
+    ) -> None:
+        base = DynamicMds(believed, confidence=confidence)
+        super().__init__(base, learned(StGnn, weights), feedback)
+
+
+class _Reckoned(SwarmFilter):
+    """Dead reckoning alone, with all links alike."""
+
+    name = "stgat"
+
+    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
+        return Found(now.place, now.variance)
+
+
+@register("stgat")
+class StGat(NetworkLoop):
+    """A purely learned baseline: plain graph attention and the same convolutions correct dead
+    reckoning in every step; no optimizer. ``weights``: a checkpoint's name or path, or ``none``."""
+
+    name = "stgat"
+
+    def __init__(self, believed: Believed, *, weights: str = "stgat") -> None:
+        network = learned(StGnn, weights, kinematic=False)
+        super().__init__(_Reckoned(believed, "none"), network, "positions")

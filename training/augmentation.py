@@ -25,7 +25,9 @@ class SwarmAugmentation(Transform):
         self.std = std
         self.generator = torch.Generator().manual_seed(seed)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

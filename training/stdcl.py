@@ -13,9 +13,9 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.checkpoint import untrained
+from agents.checkpoint import learned
 from agents.policy import LocalizerPolicy, flat, restored
-from agents.stdcl import StDcl
+from agents.stdcl import NetworkLoop
 from agents.stgnn.network import StGnn
 from coloc_env.batched import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
@@ -58,10 +58,12 @@ VARIANTS = (
     "n_uavs=150:comm_radius=2500:ins_bias=0:nlos=0.3:nlos_time=10",
     "n_uavs=100:comm_radius=2200:anchors=0.25:motion=circle",
     "n_uavs=200:comm_radius=1230",
+    "n_uavs=120:comm_radius=1800:nlos=0.3",
 )
 SCORED = ("", "ins_bias=0", "nlos=0.5", "comm_radius=2500", "motion=weave:v_max=100", "layout=u")
+METHODS, BASE = ("stdcl", "stgat"), "dwmds_st"
 _FAR = 3.0  # times the optimizer's RMSE, beyond which the loss grows linearly
-_LIKELIHOOD = 0.02  # of the covariance's likelihood in the loss
+_LIKELIHOOD = 0.05  # of the covariance's likelihood in the loss
 _SMOOTH = 0.1  # of the trajectory's second difference, in the second stage
 _SCALE_SEED = 1 << 36
 
@@ -82,7 +84,7 @@ class StDclLoss(LossModule):
     def __init__(
         self,
         network: StGnn,
-        loops: Sequence[StDcl],
+        loops: Sequence[NetworkLoop],
         scenes: Sequence[Scenario],
         scales: Sequence[float],
     ) -> None:
@@ -150,8 +152,8 @@ def stdcl(
     *,
     scenario: str = "swarm-v0:n_uavs=60:horizon=60",
     variants: str = "/".join(VARIANTS),
-    feedback: str = "learned",
-    confidence: str = "em",
+    agent: str = "stdcl",
+    start: str = "none",
     worlds: int = 4,
     epochs: int = 10,
     steps: int = 10,
@@ -165,8 +167,9 @@ def stdcl(
     """ST-DCL's graph network, trained in the closed loop that it flies in.
 
     In each of ``epochs`` epochs ``worlds`` new worlds of every one of ``variants`` (overrides of
-    ``scenario``, separated by slashes) are flown by ``stdcl`` with its newest weights and this
-    ``feedback`` and ``confidence``; every ``steps`` steps the loss is backpropagated through them.
+    ``scenario``, separated by slashes) are flown by ``agent`` (``stdcl`` with any options but
+    weights, or ``stgat``) with its newest weights; every ``steps`` steps the loss is backpropagated
+    through them. ``start``: weights to begin with, a checkpoint's name or path.
     From the share ``smooth_from`` of the epochs on it contains the trajectory's second difference.
     The learning rate falls from ``learning_rate`` to ``last_rate`` along a cosine. ``augment``: the
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
@@ -177,13 +180,15 @@ def stdcl(
     positive("stdcl", learning_rate=learning_rate, last_rate=last_rate)
     shares("stdcl", smooth_from=smooth_from)
     scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")]
-    network = untrained(StGnn, seed)
-    agent = f"stdcl:weights=none:feedback={feedback}:confidence={confidence}"
+    name = agent.split(":")[0]
+    if name not in METHODS:
+        raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
+    agent = f"{agent}:weights=none"
+    network = learned(StGnn, start, seed, kinematic=name == "stdcl")
     loops: list[Any] = [make(agent, scene) for scene in scenes]
     for one in loops:
         one.learn(network)
-    base = f"dwmds_st:confidence={confidence}"
-    loss = StDclLoss(network, loops, scenes, [_scale(base, scene) for scene in scenes])
+    loss = StDclLoss(network, loops, scenes, [_scale(scene) for scene in scenes])
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
     def launch(epoch: int) -> TakingTurns:
@@ -208,19 +213,17 @@ def stdcl(
         module=network,
         flights=flights,
         trainer=trainer,
-        score=partial(score, network, agent, base, score_runs),
+        score=partial(score, network, agent, score_runs),
     )
 
 
-def _scale(base: str, scene: Scenario) -> float:
+def _scale(scene: Scenario) -> float:
     """RMSE (m) of the optimizer alone, after it has settled."""
-    tape = play(make(base, scene), scene, _SCALE_SEED + torch.arange(4), lambda steps: None)
+    tape = play(make(BASE, scene), scene, _SCALE_SEED + torch.arange(4), lambda steps: None)
     return metrics.rmse(tape.error[:, 5:].numpy(), tape.scored[:, 5:].numpy())
 
 
-def score(
-    network: StGnn, agent: str, base: str, runs: int, tell: Progress
-) -> Mapping[str, Any]:
+def score(network: StGnn, agent: str, runs: int, tell: Progress) -> Mapping[str, Any]:
     """RMSE (m) of the loop and of its optimizer alone in the worlds of seeds 0 … runs − 1 of
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
     found: dict[str, Any] = {}
@@ -229,7 +232,7 @@ def score(
         loop: Any = make(agent, scene)
         loop.learn(network)
         each = {}
-        for name, one in (("stdcl", loop), ("dwmds_st", make(base, scene))):
+        for name, one in (("trained", loop), (BASE, make(BASE, scene))):
             tape = play(one, scene, torch.arange(runs), lambda steps: None)
             each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
         found[variant or "default"] = each

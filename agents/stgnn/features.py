@@ -46,13 +46,15 @@ class Memory(TensorClass):
 @dataclass(frozen=True)
 class Scene:
     """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, ``link`` scalars, which are
-    there (``mask``), and what carries a displacement along links: unit vectors by ``position`` (m,
-    centred) and ``length``, ``weight`` (1/m²), and ``gain`` H⁻¹ (m²)."""
+    there (``mask``), who ``moves``, and what carries a displacement along links: unit vectors by
+    ``position`` (m, centred) and ``length``, ``weight`` (1/m²), and ``gain`` H⁻¹ (m²) of links and
+    of the ``trust`` (1/m²) in dead reckoning."""
 
     scalars: Float64[Tensor, "B N F"]
     vectors: Float64[Tensor, "B N d C"]
     link: Float64[Tensor, "B N N L"]
     mask: Bool[Tensor, "B N N"]
+    moves: Bool[Tensor, "B N"]
     position: Float64[Tensor, "B N d"]
     length: Float64[Tensor, "B N N"]
     weight: Float64[Tensor, "B N N"]
@@ -62,19 +64,18 @@ class Scene:
     def to(self, like: Tensor) -> "Scene":
         """The same in another precision."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Scene(**{k: x if k == "mask" else x.to(like) for k, x in parts.items()})
+        return Scene(**{k: x if x.dtype == torch.bool else x.to(like) for k, x in parts.items()})
 
 
-def forgotten(fixed: Bool[Tensor, "B N"], dim: int) -> Memory:
-    """The memory of a team that has seen nothing."""
-    b, n = fixed.shape
-    zeros = torch.zeros(b, n, n, dtype=torch.float64, device=fixed.device)
+def forgotten(worlds: int, n: int, dim: int, device: torch.device) -> Memory:
+    """The memory of teams that have seen nothing."""
+    zeros = torch.zeros(worlds, n, n, dtype=torch.float64, device=device)
     return Memory(
         residual=zeros,
         seen=zeros.clone(),
-        innovations=zeros.new_zeros(b, n, dim, len(_TIMES)),
-        steps=zeros.new_zeros(b, n),
-        batch_size=(b, n),
+        innovations=zeros.new_zeros(worlds, n, dim, len(_TIMES)),
+        steps=zeros.new_zeros(worlds, n),
+        batch_size=(worlds, n),
     )
 
 
@@ -145,8 +146,14 @@ def look(
     pulls = along_links(y.unsqueeze(1), strengths, length.unsqueeze(1)).movedim(1, -1)
     newton, others = pulls[..., :1], pulls[..., 1:]
     vectors = torch.cat(
-        (gain @ torch.cat((newton, trust[..., None, None] * innovation.unsqueeze(-1), others), -1),
-         innovation.unsqueeze(-1), memory.innovations), -1)
+        (
+            gain
+            @ torch.cat((newton, trust[..., None, None] * innovation.unsqueeze(-1), others), -1),
+            innovation.unsqueeze(-1),
+            memory.innovations,
+        ),
+        -1,
+    )
     vectors = torch.where(now.fixed[..., None, None], 0.0, vectors)
     confidence = (weight * std**2).clamp_max(1.0)
     velocity = now.state[..., d : 2 * d]
@@ -190,10 +197,11 @@ def look(
         -1,
     )
     link = torch.stack(
-        (e, e.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence, speed / 4), -1
+        (e, e.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence, speed / 4),
+        -1,
     )
     return (
-        Scene(scalars, vectors, link, mask, y, length, eff, gain, trust),
+        Scene(scalars, vectors, link, mask, ~now.fixed, y, length, eff, gain, trust),
         memory,
     )
 

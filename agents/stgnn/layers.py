@@ -65,11 +65,10 @@ class TopologicalAttention(nn.Module):
         h = z * h + (1 - z) * bounded(heard)
         near = (share @ v.flatten(-2)).view_as(v)
         moved = carried_over(scene, v @ self.carry)
-        return h, v + self.mix(h, torch.cat((v, near, moved), -1))
+        v = v + self.mix(h, torch.cat((v, near, moved), -1))
+        return h, torch.where(scene.moves[..., None, None], v, 0.0)
 
-    def attention(
-        self, scene: Scene, mapped: Float[Tensor, "B N F"]
-    ) -> Float[Tensor, "B N N"]:
+    def attention(self, scene: Scene, mapped: Float[Tensor, "B N F"]) -> Float[Tensor, "B N N"]:
         """α, zero where there is no link, or only doubtful ones between UAVs that fly apart."""
         here, there = self.ends(mapped).unsqueeze(-2).unbind(-1)
         logit, mask = here.mT + there, scene.mask
@@ -86,14 +85,16 @@ def carried_over(scene: Scene, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B 
     """H⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j: where neighbours' displacements push a UAV."""
     y, weight, length, gain = scene.position, scene.weight, scene.length, scene.gain
     at = v.movedim(-1, 1)  # [B, C, N, d]
-    along = (y.unsqueeze(1) @ at.mT - (y.unsqueeze(1) * at).sum(-1).unsqueeze(-2)) / length.unsqueeze(1)
+    along = (
+        y.unsqueeze(1) @ at.mT - (y.unsqueeze(1) * at).sum(-1).unsqueeze(-2)
+    ) / length.unsqueeze(1)
     pushed = along_links(y.unsqueeze(1), weight.unsqueeze(1) * along, length.unsqueeze(1))
     return gain @ pushed.movedim(1, -1)
 
 
 class DilatedConvolution(nn.Module):
-    """Equation 29: y(t) = Σ_k W_k x(t − k·dilation) + b over the past alone, zeros before the start,
-    for scalars and (without b) vectors; with a residual connection.
+    """Equation 29: y(t) = Σ_k W_k x(t − k·dilation) + b over the past alone, zeros before the
+    start, for scalars and (without b) vectors; with a residual connection.
 
     One step at a time: ``past`` holds the last (kernel − 1)·dilation inputs, newest first.
     """

@@ -47,20 +47,35 @@ class StGnn(Learned):
     kind = "stgnn"
     features = (*SCALARS, *VECTORS, *LINKS)
 
-    def __init__(self, width: int = 64, kernel: int = 3, hops: int = 2, kinematic: bool = True,
-                 temporal: bool = True) -> None:
+    def __init__(
+        self,
+        width: int = 64,
+        kernel: int = 3,
+        hops: int = 2,
+        kinematic: bool = True,
+        temporal: bool = True,
+    ) -> None:
         super().__init__()
-        self.architecture = {"width": width, "kernel": kernel, "hops": hops,
-                             "kinematic": kinematic, "temporal": temporal}
+        self.architecture = {
+            "width": width,
+            "kernel": kernel,
+            "hops": hops,
+            "kinematic": kinematic,
+            "temporal": temporal,
+        }
         channels = len(VECTORS)
         self.width, self.channels = width, channels
         self.encode = nn.ModuleList((Linear(len(SCALARS), width), Linear(width, width)))
         self.hops = nn.ModuleList(
             TopologicalAttention(width, channels, _CARRIED, kinematic) for _ in range(hops)
         )
-        self.times = nn.ModuleList(
-            DilatedConvolution(width, channels, kernel, dilation) for dilation in DILATIONS
-        ) if temporal else nn.ModuleList()
+        self.times = (
+            nn.ModuleList(
+                DilatedConvolution(width, channels, kernel, dilation) for dilation in DILATIONS
+            )
+            if temporal
+            else nn.ModuleList()
+        )
         self.scale = Linear(width, 1)  # of eq. 30: which time scale counts
         self.out = Linear(width, channels)
         self.trust = nn.Parameter(torch.tensor((1.0, 0.0)))  # w, b of γ = σ(w c + b)
@@ -131,4 +146,6 @@ class StGnn(Learned):
         ends = self.edge_nodes(h)
         seen = self.edge(scene.link.to(h).flatten(1, 2)).unflatten(1, scene.mask.shape[1:])
         inside = torch.tanh(seen + ends.unsqueeze(1) + ends.unsqueeze(2))
-        return sigmoid(self.edge_out(inside.flatten(1, 2))[..., 0].unflatten(1, scene.mask.shape[1:]))
+        return sigmoid(
+            self.edge_out(inside.flatten(1, 2))[..., 0].unflatten(1, scene.mask.shape[1:])
+        )
