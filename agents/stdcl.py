@@ -1,4 +1,4 @@
-"""ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, figure 1 and Algorithm 2)."""
+"""ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, sections 4 and 4.2.3)."""
 
 from dataclasses import replace
 from typing import Literal
