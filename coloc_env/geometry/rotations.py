@@ -30,6 +30,12 @@ def cross_matrix(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3 3"]:
     return join((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(-1, (3, 3))
 
 
+def cross(a: Float[Tensor, "*s 3"], b: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+    """``a × b``."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+    return join((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
+
 def quaternion_product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
     """Hamilton product ``a ⊗ b``: rotate by ``b`` first, then by ``a``."""
     aw, ax, ay, az = a.unbind(-1)

@@ -1,0 +1,50 @@
+"""Rotations and poses in the plane and in space; conventions in ``rotations`` and ``poses``."""
+
+from coloc_env.geometry.pairs import pair_differences, pair_distances
+from coloc_env.geometry.poses import Poses
+from coloc_env.geometry.rotations import (
+    concat,
+    cross,
+    cross_matrix,
+    join,
+    plane_angle,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_log,
+    quaternion_matrix,
+    quaternion_product,
+    rotate,
+    rotate_by,
+    rotation_between,
+    rotation_matrix,
+    unrotate,
+    wrap_angle,
+    yaw_quaternion,
+)
+from coloc_env.geometry.se2 import Se2
+from coloc_env.geometry.se3 import Se3
+
+__all__ = [
+    "Poses",
+    "Se2",
+    "Se3",
+    "concat",
+    "cross",
+    "cross_matrix",
+    "join",
+    "pair_differences",
+    "pair_distances",
+    "plane_angle",
+    "quaternion_conjugate",
+    "quaternion_exp",
+    "quaternion_log",
+    "quaternion_matrix",
+    "quaternion_product",
+    "rotate",
+    "rotate_by",
+    "rotation_between",
+    "rotation_matrix",
+    "unrotate",
+    "wrap_angle",
+    "yaw_quaternion",
+]

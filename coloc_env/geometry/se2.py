@@ -1,0 +1,102 @@
+"""SE(2): poses in the plane, ``[x, y, θ]`` (Solà et al. 2018, "A micro Lie theory", section E)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coloc_env.geometry.coefficients import inverse_coefficient, stumpff
+from coloc_env.geometry.poses import Poses
+from coloc_env.geometry.rotations import join, wrap_angle, yaw_quaternion
+
+
+class Se2(Poses):
+    """Poses in the plane; headings are kept in [-π, π)."""
+
+    dim, dof, size = 2, 3, 3
+
+    @staticmethod
+    def quaternion(x: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:
+        """The attitude as a quaternion."""
+        return yaw_quaternion(x[..., 2])
+
+    @staticmethod
+    def exp(xi: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+        """Tangent vector to pose."""
+        u, v, angle = xi.unbind(-1)
+        along, across = _arc(angle)
+        return join((along * u - across * v, across * u + along * v, wrap_angle(angle)))
+
+    @staticmethod
+    def log(x: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+        """Pose to the tangent vector of angle at most π."""
+        px, py, heading = x.unbind(-1)
+        angle = wrap_angle(heading)
+        along, half = _chord(angle)
+        return join((along * px + half * py, along * py - half * px, angle))
+
+    @staticmethod
+    def compose(a: Float[Tensor, "*s 3"], b: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+        """``a b``: first ``b``, then ``a``."""
+        (ax, ay, a_heading), (bx, by, b_heading) = a.unbind(-1), b.unbind(-1)
+        cosine, sine = a_heading.cos(), a_heading.sin()
+        return join(
+            (
+                ax + cosine * bx - sine * by,
+                ay + sine * bx + cosine * by,
+                wrap_angle(a_heading + b_heading),
+            )
+        )
+
+    @staticmethod
+    def between(a: Float[Tensor, "*s 3"], b: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+        """``a⁻¹ b``: the pose of ``b`` as seen from ``a``."""
+        (ax, ay, a_heading), (bx, by, b_heading) = a.unbind(-1), b.unbind(-1)
+        cosine, sine, dx, dy = a_heading.cos(), a_heading.sin(), bx - ax, by - ay
+        return join(
+            (cosine * dx + sine * dy, cosine * dy - sine * dx, wrap_angle(b_heading - a_heading))
+        )
+
+    @staticmethod
+    def carry(x: Float[Tensor, "*s 3"], xi: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3"]:
+        """``Ad(x) ξ = [R ρ + φ (y, −x), φ]``."""
+        (px, py, heading), (u, v, angle) = x.unbind(-1), xi.unbind(-1)
+        cosine, sine = heading.cos(), heading.sin()
+        turned = (cosine * u - sine * v + angle * py, sine * u + cosine * v - angle * px)
+        return join((*turned, angle.expand_as(turned[0])))
+
+    @staticmethod
+    def right_jacobian(xi: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3 3"]:
+        """``J_r(ξ)``, Solà et al. eq. 163."""
+        u, v, angle = xi.unbind(-1)
+        second, third = stumpff(angle * angle, (2, 3))
+        along, across = _arc(angle)
+        third = third * angle
+        last = (third * u - second * v, second * u + third * v)
+        return _upper((along, across, last[0], -across, along, last[1]))
+
+    @staticmethod
+    def right_jacobian_inverse(xi: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 3 3"]:
+        """``J_r(ξ)⁻¹``, for angles below 2π."""
+        u, v, angle = xi.unbind(-1)
+        along, half = _chord(angle)
+        turn = angle * inverse_coefficient(angle * angle)
+        last = (turn * u + 0.5 * v, turn * v - 0.5 * u)
+        return _upper((along, -half, last[0], half, along, last[1]))
+
+
+def _arc(angle: Float[Tensor, "*s"]) -> tuple[Tensor, Tensor]:
+    """``sin θ / θ`` and ``(1 − cos θ)/θ``: where a unit path that turns by θ leads."""
+    first, second = stumpff(angle * angle, (1, 2))
+    return first, angle * second
+
+
+def _chord(angle: Float[Tensor, "*s"]) -> tuple[Tensor, Tensor]:
+    """``½θ cot ½θ`` and ``½θ``: the inverse of ``_arc``'s matrix."""
+    squared = angle * angle
+    return 1 - squared * inverse_coefficient(squared), 0.5 * angle
+
+
+def _upper(rows: tuple[Tensor, ...]) -> Float[Tensor, "*s 3 3"]:
+    """The matrix of two rows given and ``[0, 0, 1]``."""
+    zero, one = torch.zeros_like(rows[0]), torch.ones_like(rows[0])
+    return join((*rows, zero, zero, one)).unflatten(-1, (3, 3))
