@@ -12,13 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_SMALL = 0.25  # rad²; seven terms of either series are then exact to float64
-_TERMS = 7
-# |B_2n| / (2n)!, n = 1 … 7, with the Bernoulli numbers B_2n
+_SMALL = 1.0  # rad²; ten terms of either series are then exact to float64
+_TERMS = 10
+# |B_2|, |B_4|, …, |B_20|, the Bernoulli numbers
 _BERNOULLI = (
-    *(1 / 12, 1 / 720, 1 / 30240, 1 / 1209600),
-    *(1 / 47900160, 691 / 1307674368000, 1 / 74724249600),
+    *(1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66),
+    *(691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330),
 )
+_INVERSE_SERIES = [b / factorial(2 * n) for n, b in enumerate(_BERNOULLI, start=1)]
 
 
 def stumpff(squared: Float[Tensor, "*s"], orders: Sequence[int]) -> list[Float[Tensor, "*s"]]:
@@ -45,7 +46,7 @@ def inverse_coefficient(squared: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
     small, large = squared.clamp(max=_SMALL), squared.clamp(min=_SMALL)
     half = 0.5 * large.sqrt()
     closed = (1 - half / half.tan()) / large
-    return torch.where(squared < _SMALL, _horner(small, _BERNOULLI), closed)
+    return torch.where(squared < _SMALL, _horner(small, _INVERSE_SERIES), closed)
 
 
 def _horner(x: Float[Tensor, "*s"], terms: Sequence[float]) -> Float[Tensor, "*s"]:
