@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_SMALL = 1.0  # rad²; ten terms of either series are then exact to float64
-_TERMS = 10
+_SMALL = 1.0  # rad²; up to here the terms below are all that float64 can tell
+_TERMS = 9
 # |B_2|, |B_4|, …, |B_20|, the Bernoulli numbers
 _BERNOULLI = (
     *(1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66),

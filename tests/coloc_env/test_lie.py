@@ -231,6 +231,20 @@ def test_jacobians_leave_their_own_argument(poses: type[Poses]) -> None:
     close((poses.right_jacobian_inverse(r) @ r.unsqueeze(-1))[..., 0], r, 1e-12)
 
 
+@both
+def test_a_step_at_either_end_closes_one_relative_pose(poses: type[Poses]) -> None:
+    """For r = log(T⁻¹ x_i⁻¹ x_j): −r at x_j, or Ad(T) r at x_i, and nothing is left."""
+    start, measured, noise = (tangents(poses, n)[:15] for n in (15, 16, 17))
+    x_i, t = poses.exp(start), poses.exp(measured.roll(3, 0))
+    x_j = poses.plus(poses.compose(x_i, t), noise.roll(7, 0))
+    r = poses.minus(poses.between(x_i, x_j), t)
+    assert r.norm(dim=-1).max() > 1
+    at_j = poses.between(x_i, poses.plus(x_j, -r))
+    at_i = poses.between(poses.plus(x_i, poses.carry(t, r)), x_j)
+    for closed in (at_j, at_i):
+        close(poses.minus(closed, t), torch.zeros_like(r), 1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_coefficients_meet_where_the_series_ends(dtype: torch.dtype) -> None:
     """Against the series with twice the terms, which float64 sums exactly up to s = 2."""
