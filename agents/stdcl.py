@@ -71,7 +71,7 @@ class NetworkLoop(Localizer[LoopBelief]):
             LoopBelief,
             shape,
             base=base,
-            memory=forgotten(*shape, d, base.step.device),
+            memory=forgotten(shape[0], shape[1], d, base.step.device),
             past=self.network.start(shape, d),
             confidence=base.variance.new_ones(*shape, shape[1]),
         )

@@ -20,7 +20,6 @@ from agents.stgnn.network import StGnn
 from coloc_env.batched import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
-from coloc_env.sensors import Ranging
 from training import metrics
 from training.augmentation import SwarmAugmentation
 from training.fleets import TakingTurns
@@ -201,8 +200,7 @@ def stdcl(
         for i, (loop, scene) in enumerate(zip(loops, scenes, strict=True)):
             env: Any = CoLocEnv(scene, worlds, seed=first + i * worlds)
             if augment:
-                ranging = scene.believed.sensor(Ranging)
-                env = TransformedEnv(env, SwarmAugmentation(ranging.noise.std, first + i))
+                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i))
             policy = LocalizerPolicy(loop, scene, record=partial(_recorded, i))
             collectors.append(fly(env, policy, steps, compact_obs=True))
         return TakingTurns(collectors)

@@ -41,7 +41,7 @@ class StGnn(Learned):
     """Equations 25 to 35, with vectors in metres beside the paper's scalars.
 
     ``width`` d = 64; ``kernel`` 3 (the paper says 3 in one place, and means 2 in another);
-    ``kinematic=False``: plain graph attention.
+    ``kinematic=False``: plain graph attention; ``temporal=False``: no convolutions.
     """
 
     kind = "stgnn"
@@ -69,12 +69,9 @@ class StGnn(Learned):
         self.hops = nn.ModuleList(
             TopologicalAttention(width, channels, _CARRIED, kinematic) for _ in range(hops)
         )
-        self.times = (
-            nn.ModuleList(
-                DilatedConvolution(width, channels, kernel, dilation) for dilation in DILATIONS
-            )
-            if temporal
-            else nn.ModuleList()
+        self.times = nn.ModuleList(
+            DilatedConvolution(width, channels, kernel, dilation)
+            for dilation in (DILATIONS if temporal else ())
         )
         self.scale = Linear(width, 1)  # of eq. 30: which time scale counts
         self.out = Linear(width, channels)
@@ -88,9 +85,13 @@ class StGnn(Learned):
             nn.init.zeros_(layer.bias)
         nn.init.constant_(self.edge_out.bias, 4.0)
 
+    @property
+    def _layers(self) -> list[DilatedConvolution]:
+        return [layer for layer in self.times if isinstance(layer, DilatedConvolution)]
+
     def start(self, shape: torch.Size, dim: int) -> Past:
         """Zeros: nothing before the first step."""
-        steps = sum(one.length for one in self.times)
+        steps = sum(layer.length for layer in self._layers)
         like = self.out.weight
         return Past(
             scalars=like.new_zeros(*shape, steps, self.width),
@@ -124,28 +125,27 @@ class StGnn(Learned):
         if not self.times:
             return h, v, past
         begin, scalars, vectors = 0, [], []
-        found: list[tuple[Tensor, Tensor]] = []
-        for layer in self.times:
-            end = begin + layer.length
-            past_h, past_v = past.scalars[:, :, begin:end], past.vectors[:, :, begin:end]
-            scalars.append(pushed_on(past_h, h))
-            vectors.append(pushed_on(past_v, v))
-            h, v = layer(h, v, past_h, past_v)
-            found.append((h, v))
-            begin = end
-        shares = torch.softmax(torch.cat([self.scale(h) for h, _ in found], -1), -1).unbind(-1)
-        h = sum(s.unsqueeze(-1) * h for s, (h, _) in zip(shares, found, strict=True))
-        v = sum(s[..., None, None] * v for s, (_, v) in zip(shares, found, strict=True))
-        past = Past(
-            scalars=torch.cat(scalars, 2), vectors=torch.cat(vectors, 2), batch_size=past.batch_size
-        )
-        return h, v, past
+        found_h, found_v = [], []
+        for layer in self._layers:
+            steps = slice(begin, begin + layer.length)
+            begin = steps.stop
+            before_h, before_v = past.scalars[:, :, steps], past.vectors[:, :, steps]
+            scalars.append(pushed_on(before_h, h))
+            vectors.append(pushed_on(before_v, v))
+            h, v = layer(h, v, before_h, before_v)
+            found_h.append(h)
+            found_v.append(v)
+        each_h, each_v = torch.stack(found_h, -1), torch.stack(found_v, -1)
+        share = torch.softmax(torch.cat([self.scale(h) for h in found_h], -1), -1)
+        h = (each_h * share.unsqueeze(-2)).sum(-1)
+        v = (each_v * share[..., None, None, :]).sum(-1)
+        after = (torch.cat(scalars, 2), torch.cat(vectors, 2))
+        return h, v, Past(scalars=after[0], vectors=after[1], batch_size=past.batch_size)
 
     def _confidence(self, scene: Scene, h: Tensor) -> Float[Tensor, "B N N"]:
         """What either end says of a link, alike from both."""
-        ends = self.edge_nodes(h)
-        seen = self.edge(scene.link.to(h).flatten(1, 2)).unflatten(1, scene.mask.shape[1:])
-        inside = torch.tanh(seen + ends.unsqueeze(1) + ends.unsqueeze(2))
-        return sigmoid(
-            self.edge_out(inside.flatten(1, 2))[..., 0].unflatten(1, scene.mask.shape[1:])
-        )
+        n = h.shape[1]
+        ends, seen = self.edge_nodes(h), self.edge(scene.link.flatten(1, 2))
+        inside = torch.tanh(seen.unflatten(1, (n, n)) + ends.unsqueeze(1) + ends.unsqueeze(2))
+        logit: Tensor = self.edge_out(inside.flatten(1, 2))[..., 0]
+        return sigmoid(logit.unflatten(1, (n, n)))
