@@ -1,6 +1,8 @@
-"""How well a scenario's UAVs can be localized at all: the posterior Cramér–Rao bound."""
+"""How well a scenario's UAVs can be localized at all: Cramér–Rao bounds, posterior and of a
+snapshot."""
 
 from coloc_env.bounds.mixture import range_information
 from coloc_env.bounds.posterior import Bound, posterior_bound
+from coloc_env.bounds.snapshot import SnapshotBound, snapshot_bound
 
-__all__ = ["Bound", "posterior_bound", "range_information"]
+__all__ = ["Bound", "SnapshotBound", "posterior_bound", "range_information", "snapshot_bound"]

@@ -1,4 +1,5 @@
-"""What all of a scenario's sensors tell in one step, in expectation over where the team may be."""
+"""What all of a scenario's sensors tell in one step, at the truth and in expectation over where the
+team may be."""
 
 import torch
 from jaxtyping import Float64
@@ -10,6 +11,9 @@ from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
 from coloc_env.sensors import Imu, Ins, Odometry, Sensor
 
+# About single UAVs' states, and about the team's (None: no sensor has it).
+Information = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B m m"] | None]
+
 
 def expected_information(
     sensors: list[Sensor],
@@ -17,24 +21,43 @@ def expected_information(
     seen: Observation,
     drawn: Float64[Tensor, "B N E"],
     pose: Float64[Tensor, "D E"],
-) -> tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B m m"] | None]:
-    """``E Σ Hᵀ R⁻¹ H`` about single UAVs' states, and about the team's (None: no sensor has it).
+) -> Information:
+    """``E Σ Hᵀ R⁻¹ H`` about the states, of which ``pose`` makes poses.
 
-    The expectation is the mean over the truth moved by +drawn and −drawn state errors. IMU, INS
-    and odometry drive the process, and count there.
+    The expectation is the mean over the truth moved by +drawn and −drawn state errors.
     """
-    size, n = pose.shape[1], drawn.shape[1]
-    own, shared = torch.zeros(*drawn.shape, size, dtype=torch.float64), None
-    truth, seen = moved(truth, drawn @ pose.mT), _twice(seen)
+    own, shared = pose_information(sensors, moved(truth, drawn @ pose.mT), _twice(seen))
+    return about_states(pose, _mean(own), None if shared is None else _mean(shared))
+
+
+def pose_information(
+    sensors: list[Sensor], truth: Kinematics, seen: Observation
+) -> tuple[Float64[Tensor, "B N D D"], Float64[Tensor, "B N D N D"] | None]:
+    """``Σ Hᵀ R⁻¹ H`` at the truth: about single UAVs' poses, and about the team's (None: no sensor
+    has it). IMU, INS and odometry drive the process, and count there."""
+    size = 6 if truth.position.shape[-1] == 3 else 3
+    own = truth.position.new_zeros(*truth.position.shape[:2], size, size)
+    shared = None
     for sensor in sensors:
         if isinstance(sensor, SHARED):
-            joint = _mean(shared_information(sensor, truth, seen))
-            joint = torch.einsum("de,bidjf,fg->biejg", pose, joint, pose)
-            joint = joint.reshape(-1, n * size, n * size)
+            joint = shared_information(sensor, truth, seen)
             shared = joint if shared is None else shared + joint
         elif not isinstance(sensor, Imu | Ins | Odometry):
-            own += pose.mT @ _mean(own_information(sensor, truth, seen)) @ pose
+            own += own_information(sensor, truth, seen)
     return own, shared
+
+
+def about_states(
+    pose: Float64[Tensor, "D E"],
+    own: Float64[Tensor, "B N D D"],
+    shared: Float64[Tensor, "B N D N D"] | None,
+) -> Information:
+    """From information about poses to that about the states behind them."""
+    own = pose.mT @ own @ pose
+    if shared is None:
+        return own, None
+    joint = torch.einsum("de,bidjf,fg->biejg", pose, shared, pose)
+    return own, joint.flatten(3, 4).flatten(1, 2)
 
 
 def moved(truth: Kinematics, errors: Float64[Tensor, "B N D"]) -> Kinematics:

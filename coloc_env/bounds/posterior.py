@@ -29,7 +29,6 @@ rule out large errors.
   is taken as a Gaussian (see ``process``).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -41,12 +40,9 @@ from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.information import SHARED
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
+from coloc_env.bounds.worlds import seeds_of, worlds
 from coloc_env.motion import Kidnapped, Kinematics
-from coloc_env.observation import Observation, action_width
 from coloc_env.scenario import Scenario
-from coloc_env.world import World
-
-_NUMBERS = 2**24  # of joint matrices held at once: 128 MiB
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +89,12 @@ def posterior_bound(
     if isinstance(scenario.motion, Kidnapped):
         raise ValueError("posterior_bound: no bound is known for a team that is kidnapped")
     steps = scenario.horizon if steps is None else steps
-    if runs < 1 or not 1 <= steps <= scenario.horizon:
-        raise ValueError(
-            f"posterior_bound: runs={runs}, steps={steps} is not allowed: at least one run, and "
-            f"steps from 1 to {scenario.horizon}"
-        )
     model = error_model(scenario)
     joint = scenario.arena.n_uavs * model.pose().shape[1]
-    at_once = max(1, _NUMBERS // joint**2)
-    seeds = torch.arange(seed, seed + runs).split(at_once)
-    blocks = [_bound(scenario, model, block, steps, cooperative) for block in seeds]
+    blocks = [
+        _bound(scenario, model, seeds, steps, cooperative)
+        for seeds in seeds_of("posterior_bound", scenario, runs, seed, steps, joint)
+    ]
     mse, scored = (torch.cat(parts) for parts in zip(*blocks, strict=True))
     return Bound(mse, scored, scenario.arena.dt)
 
@@ -126,11 +118,13 @@ def _bound(
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
     before: Kinematics | None = None
     mse, scored = [], []
-    for truth, seen, white, counts in _worlds(scenario, seeds, steps, states[2]):
+    for step, (truth, seen, counts) in enumerate(worlds(scenario, seeds, steps)):
         if before is not None:
             f, q = model.transition(before, truth)
             covariance = predict(covariance, _by_team(f, n), _by_team(q, n))
         root = torch.linalg.cholesky(covariance)
+        keys = noise.fold(noise.row_keys(seeds), step)
+        white = noise.normal(keys, "bound", states[1] * states[2]).double()
         drawn = (2**0.5 * root @ white.reshape(len(root), -1, 1)).view(states)
         own, shared = expected_information(sensors, truth, seen, drawn, pose)
         covariance = update(root, _by_team(own, n), shared)
@@ -139,21 +133,6 @@ def _bound(
         scored.append(counts)
         before = truth
     return torch.stack(mse, 1), torch.stack(scored, 1)
-
-
-def _worlds(
-    scenario: Scenario, seeds: Int64[Tensor, "B"], steps: int, errors: int
-) -> Iterator[tuple[Kinematics, Observation, Float64[Tensor, "B N E"], Bool[Tensor, "B N"]]]:
-    """Truth, observation, standard normal draws and who is scored, step by step."""
-    world = World(scenario, len(seeds))
-    seen, n = world.reset(seeds), scenario.arena.n_uavs
-    idle = torch.zeros(len(seeds), n, action_width(scenario))
-    for step in range(steps):
-        keys = noise.fold(noise.row_keys(seeds), step)
-        white = noise.normal(keys, "bound", n * errors).double().unflatten(-1, (n, errors))
-        yield world.truth, seen, white, world.score(idle)[1]
-        world.advance(idle)
-        seen = world.observation()
 
 
 def _by_team(x: Float64[Tensor, "B N E E"], n: int) -> Float64[Tensor, "T n E E"]:

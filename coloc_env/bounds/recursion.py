@@ -28,12 +28,19 @@ def update(
     shared: Float64[Tensor, "T m m"] | None,
 ) -> Float64[Tensor, "T m m"]:
     """``(P⁻¹ + I)⁻¹`` for P = root rootᵀ (Cholesky) and information I, own and shared."""
-    information = torch.cholesky_inverse(root)
+    information = add(torch.cholesky_inverse(root), own, shared)
+    return torch.cholesky_inverse(torch.linalg.cholesky(information))
+
+
+def add(
+    information: Float64[Tensor, "T m m"],
+    own: Float64[Tensor, "T n E E"],
+    shared: Float64[Tensor, "T m m"] | None,
+) -> Float64[Tensor, "T m m"]:
+    """``information`` plus own and shared information, in place."""
     blocks = own.shape[1:3]
     _diagonal(information.unflatten(1, blocks).unflatten(-1, blocks)).add_(own)
-    if shared is not None:
-        information += shared
-    return torch.cholesky_inverse(torch.linalg.cholesky(information))
+    return information if shared is None else information.add_(shared)
 
 
 def _diagonal(x: Float64[Tensor, "T n E n E"]) -> Float64[Tensor, "T n E E"]:

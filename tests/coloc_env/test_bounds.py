@@ -14,7 +14,7 @@ from scipy.stats import exponnorm, norm
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.bounds import Bound, posterior, posterior_bound, range_information
+from coloc_env.bounds import Bound, posterior_bound, range_information, worlds
 from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.information import SHARED, own_information, shared_information
 from coloc_env.bounds.mixture import error_density
@@ -706,7 +706,7 @@ def test_runs_are_the_worlds_of_their_seeds(monkeypatch: pytest.MonkeyPatch) -> 
     three = posterior_bound(task, runs=3, seed=4, steps=10)
     last = posterior_bound(task, runs=1, seed=6, steps=10)
     torch.testing.assert_close(three.mse[2:], last.mse)
-    monkeypatch.setattr(posterior, "_NUMBERS", 1)
+    monkeypatch.setattr(worlds, "_NUMBERS", 1)
     torch.testing.assert_close(posterior_bound(task, 3, 4, 10).mse, three.mse)
 
 
