@@ -339,7 +339,7 @@ def test_maximum_likelihood_attains_the_bound_under_gaussian_noise() -> None:
     def fit(residual: Any, jacobian: Any, start: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(least_squares(residual, start, jacobian, x_scale=10.0).x)
 
-    assert efficiency(team(n_uavs=12, nlos=0.0, anchor_std=0.0), 300, fit) == pytest.approx(
+    assert efficiency(team(n_uavs=12, nlos=0.0, anchor_std=0.0), 200, fit) == pytest.approx(
         1.0, abs=0.06
     )
 
@@ -359,7 +359,7 @@ def test_maximum_likelihood_comes_near_the_bound_under_nlos() -> None:
 
         return np.asarray(minimize(loss, start, jac=True, method="BFGS", tol=1e-4).x)
 
-    found = efficiency(team(n_uavs=40, anchors=0.8, anchor_std=0.0), 150, fit)
+    found = efficiency(team(n_uavs=40, anchors=0.8, anchor_std=0.0), 80, fit)
     assert 0.9 < found < 1.06
 
 
@@ -396,7 +396,7 @@ def test_a_prior_that_says_nothing_leaves_the_snapshot(monkeypatch: pytest.Monke
 
 
 def test_posterior_is_below_the_snapshot_as_both_are_reported() -> None:
-    task = make_scenario("swarm-v0", n_uavs=60, horizon=20)
+    task = make_scenario("swarm-v0", n_uavs=40, horizon=12)
     whole, now = posterior_bound(task, 2), snapshot_bound(task, 2)
     assert torch.equal(whole.scored, now.scored)
     assert whole.rmse < now.rmse
