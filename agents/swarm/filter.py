@@ -1,7 +1,7 @@
 """What localizers of whole swarms share: dead reckoning, position fixes, and weights of links."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -19,6 +19,7 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import PositionFix, Ranging
 
+UNKNOWN = 1e12  # m²: variance of a position of which nothing is known
 Confidence = Literal["none", "huber", "em"]
 
 
@@ -211,6 +212,26 @@ class SwarmFilter(Localizer[SwarmBelief]):
         error = links.distance - lengths(place)
         once = torch.triu(known, 1)
         return calibration.learned(model, error.flatten(1), once.flatten(1), self.std)
+
+
+def begun(now: Prepared) -> Prepared:
+    """The same where every UAV has a place to start from: who has none (a prior that is no number)
+    gets the middle of its neighbours', or of all, with a variance of ``UNKNOWN``."""
+    known = now.place.isfinite().all(-1)
+    if bool(known.all()):
+        return now
+    place = torch.where(known.unsqueeze(-1), now.place, 0.0)
+    count = known.double().unsqueeze(-1)
+    linked = now.links.mask.double()
+    near, everywhere = linked @ count, count.sum(1, keepdim=True).clamp_min(1.0)
+    middle = torch.where(
+        near > 0, linked @ place / near.clamp_min(1.0), place.sum(1, keepdim=True) / everywhere
+    )
+    return replace(
+        now,
+        place=torch.where(known.unsqueeze(-1), place, middle),
+        variance=torch.where(known, now.variance, UNKNOWN),
+    )
 
 
 def own_blocks(joint: Float64[Tensor, "B N d N*d"]) -> Float64[Tensor, "B N d d"]:

@@ -40,3 +40,15 @@ def lengths(position: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N N"]:
     """Distances between all members (m, 1e-9 at least)."""
     apart = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
     return apart.clamp_min(1e-9)
+
+
+def connected(mask: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N N"]:
+    """Who is in the same connected part of the network, everybody with itself."""
+    reach = mask.clone()
+    reach.diagonal(dim1=-2, dim2=-1).fill_(True)
+    while True:
+        paths = reach.to(torch.float32)
+        further = paths @ paths > 0
+        if torch.equal(further, reach):
+            return reach
+        reach = further

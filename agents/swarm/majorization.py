@@ -4,11 +4,15 @@ S(y) = Σ_{i<j} W_ij (d_ij − ‖y_i − y_j‖)² + Σ_i λ_i ‖y_i − m_i�
 folded into the prior m). de Leeuw 1977; Costa, Patwari & Hero, ACM TOSN 2006.
 """
 
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.swarm.links import lengths
+
+RELAXED = 1.9  # ω of steps beyond the majorant's minimum; at 2 they could go on for ever
 
 
 def stress(
@@ -63,3 +67,42 @@ def guttman(
     down = descent(y, distance, weight, prior, trust)
     down = torch.where(fixed.unsqueeze(-1), 0.0, down)
     return y + torch.cholesky_solve(down, factor)
+
+
+def own_pull(
+    weight: Float64[Tensor, "B N N"], fixed: Bool[Tensor, "B N"]
+) -> Float64[Tensor, "B N"]:
+    """Σ_j W_ij, once for neighbours that are fixed and twice for those that move as well: a
+    diagonal that is no less than V of ``majorizer`` without λ."""
+    moving = (~fixed).double().unsqueeze(-1)
+    return weight.sum(-1) + (weight @ moving)[..., 0]
+
+
+def nodewise(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B N N"],
+    prior: Float64[Tensor, "B N d"],
+    trust: Float64[Tensor, "B N"],
+    fixed: Bool[Tensor, "B N"],
+) -> Float64[Tensor, "B N d"]:
+    """One sweep in which every UAV moves by itself, neighbours held, all at once (Jacobi): y_i ←
+    y_i + ω (−½ ∂S/∂y_i) / (``own_pull`` + λ_i). It never raises the stress, as ω ≤ 2 (de Leeuw &
+    Heiser 1980); anchors stay, and who has neither links nor prior."""
+    bound = own_pull(weight, fixed) + trust
+    down = descent(y, distance, weight, prior, trust).masked_fill(fixed.unsqueeze(-1), 0.0)
+    return y + RELAXED * down / torch.where(bound > 0, bound, 1.0).unsqueeze(-1)
+
+
+def repeated(
+    move: Callable[[Float64[Tensor, "B N d"]], Float64[Tensor, "B N d"]],
+    y: Float64[Tensor, "B N d"],
+    step: Int64[Tensor, "B N"],
+    iterations: int,
+    first: int,
+) -> Float64[Tensor, "B N d"]:
+    """``iterations`` moves, ``first`` in worlds whose first step it is."""
+    begins = (step == 0).any(-1)[:, None, None]
+    for k in range(first if bool(begins.any()) else iterations):
+        y = torch.where(begins | (k < iterations), move(y), y)
+    return y

@@ -38,3 +38,13 @@ def calibrated(
     """Weights and shifts of a mixture that was fitted to links between anchors."""
     weight, shift = judged(model, residual, added, std)
     return weight * mask, shift
+
+
+def loess(
+    distance: Float64[Tensor, "B N N"], mask: Bool[Tensor, "B N N"], bandwidth: float
+) -> Float64[Tensor, "B N N"]:
+    """exp(−d²/h²) with h ``bandwidth`` times the longest range that either end has (Costa, Patwari
+    & Hero 2006, after Cleveland's LOESS): near neighbours count more."""
+    longest = (distance * mask).amax(-1)
+    longest = torch.maximum(longest.unsqueeze(-1), longest.unsqueeze(-2)).clamp_min(1e-9)
+    return torch.exp(-(distance / longest / bandwidth).square()) * mask
