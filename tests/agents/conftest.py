@@ -100,7 +100,8 @@ CHOSEN = {
     "hpff": ("anchors", "tags", "wsn"),
     "nnhpff": ("anchors", "tags", "wsn"),
     **dict.fromkeys(("dwmds_st", "map"), ("nlos", "anchors", "slots", "swarm")),
-    "mds": ("nlos", "anchors", "slots"),
+    **dict.fromkeys(("mds", "dwmds", "vmds"), ("nlos", "anchors", "slots")),
+    "fcmds": ("anchors", "slots"),
     "gn": ("slots",),
 }
 ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm")]

@@ -130,7 +130,7 @@ def test_fcmds_ends_where_scipy_finds_the_least_stress() -> None:
 
 
 def test_the_velocity_term_is_that_of_dead_reckoning() -> None:
-    """λ_s ‖(p(t) − p(t−1))/Δt − v‖² = λ_s/Δt² ‖p(t) − (p(t−1) + v Δt)‖²: half the$
+    """λ_s ‖(p(t) − p(t−1))/Δt − v‖² = λ_s/Δt² ‖p(t) − (p(t−1) + v Δt)‖²: half the
     step in time, four times the weight in space."""
     now = team(4)
     slow = method("vmds:velocity_weight=0.04")
