@@ -3,15 +3,14 @@ weighted-multidimensional scaling for node localization in sensor networks", ACM
 """
 
 import math
+from functools import partial
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from agents.localizer import register
 from agents.swarm.filter import Found, Prepared, SwarmBelief, SwarmFilter, begun
 from agents.swarm.links import lengths
-from agents.swarm.majorization import RELAXED, nodewise, own_pull, repeated
+from agents.swarm.majorization import RELAXED, nodewise, own_pull, repeated, require_iterations
 from agents.swarm.spread import spread, told
 from agents.swarm.weights import loess
 from coloc_env.scenario import Believed
@@ -52,10 +51,7 @@ class CostaMds(SwarmFilter):
             raise ValueError(f"prior_weight={prior_weight} is not allowed: a number ≥ 0 is needed")
         if not reach > 0:
             raise ValueError(f"reach={reach} is not allowed: a distance in m > 0 is needed")
-        if not 1 <= iterations <= first:
-            raise ValueError(
-                f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
-            )
+        require_iterations(iterations, first)
         self.bandwidth, self.prior_weight, self.reach = bandwidth, prior_weight, reach
         self.iterations, self.first = iterations, first
 
@@ -65,10 +61,9 @@ class CostaMds(SwarmFilter):
         near = now.links.mask & (lengths(prior) <= self.reach)
         weight = loess(distance, near, self.bandwidth) / self.std**2
         trust = torch.where(fixed, 0.0, self.prior_weight / now.variance)
-
-        def sweep(y: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N d"]:
-            return nodewise(y, distance, weight, prior, trust, fixed)
-
+        sweep = partial(
+            nodewise, distance=distance, weight=weight, prior=prior, trust=trust, fixed=fixed
+        )
         y = repeated(sweep, prior, belief.step, self.iterations, self.first)
         information = told(y, distance, weight, fixed, now.variance, self.std)
         start = own_pull(weight, fixed) / (RELAXED * self.iterations)

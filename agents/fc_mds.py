@@ -5,6 +5,7 @@ the network is taken as fully connected, missing links made by shortest paths; a
 alike; and maps are refined iteratively (sections 2.1 and 5.3). This is our reading of that.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -15,7 +16,7 @@ from agents.localizer import register
 from agents.mds import MdsMap
 from agents.swarm.filter import Found, Prepared, SwarmBelief, begun
 from agents.swarm.links import connected, lengths
-from agents.swarm.majorization import RELAXED, descent, repeated
+from agents.swarm.majorization import RELAXED, descent, repeated, require_iterations
 from agents.swarm.spread import spread, told
 from coloc_env.scenario import Believed
 
@@ -41,10 +42,7 @@ class FullyConnectedMds(MdsMap):
         first: int = 60,
     ) -> None:
         super().__init__(believed)
-        if not 1 <= iterations <= first:
-            raise ValueError(
-                f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
-            )
+        require_iterations(iterations, first)
         self.start, self.iterations, self.first = start, iterations, first
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
@@ -54,10 +52,9 @@ class FullyConnectedMds(MdsMap):
             begins = super().find(belief, now)
         distance, fixed, together = now.links.distance, now.fixed, connected(now.links.mask)
         weight, _ = self.weigh(begins.position, now)
-
-        def refine(y: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N d"]:
-            return completed(y, distance, now.links.mask, together, fixed)
-
+        refine = partial(
+            completed, distance=distance, mask=now.links.mask, together=together, fixed=fixed
+        )
         y = repeated(refine, begins.position, belief.step, self.iterations, self.first)
         information = told(y, distance, weight, fixed, now.variance, self.std)
         kept = together.sum(-1) / (RELAXED * self.iterations * self.std**2)

@@ -5,14 +5,13 @@ without window and confidence.
 """
 
 import math
+from functools import partial
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from agents.localizer import register
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, begun
-from agents.swarm.majorization import guttman, majorizer, repeated
+from agents.swarm.majorization import guttman, majorizer, repeated, require_iterations
 from agents.swarm.spread import spread, told
 from coloc_env.scenario import Believed
 
@@ -44,10 +43,7 @@ class VelocityMds(SwarmFilter):
         super().__init__(believed, confidence)
         if not 0 < velocity_weight < math.inf:
             raise ValueError(f"velocity_weight={velocity_weight} is not allowed: > 0 s²/m²")
-        if not 1 <= iterations <= first:
-            raise ValueError(
-                f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
-            )
+        require_iterations(iterations, first)
         self.velocity_weight, self.iterations, self.first = velocity_weight, iterations, first
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
@@ -58,15 +54,15 @@ class VelocityMds(SwarmFilter):
         for _ in range(_ROUNDS):
             weight, shift = self.weigh(y, now)
             distance, factor = now.links.distance - shift, majorizer(weight, trust, fixed)
-
-            def move(
-                y: Float64[Tensor, "B N d"],
-                distance: Float64[Tensor, "B N N"] = distance,
-                weight: Float64[Tensor, "B N N"] = weight,
-                factor: Float64[Tensor, "B N N"] = factor,
-            ) -> Float64[Tensor, "B N d"]:
-                return guttman(y, distance, weight, prior, trust, fixed, factor)
-
+            move = partial(
+                guttman,
+                distance=distance,
+                weight=weight,
+                prior=prior,
+                trust=trust,
+                fixed=fixed,
+                factor=factor,
+            )
             y = repeated(move, y, belief.step, self.iterations, self.first)
         information = told(y, distance, weight, fixed, now.variance, self.std)
         return Found(y, spread(information, trust, now.variance, fixed))

@@ -106,3 +106,11 @@ def repeated(
     for k in range(first if bool(begins.any()) else iterations):
         y = torch.where(begins | (k < iterations), move(y), y)
     return y
+
+
+def require_iterations(iterations: int, first: int) -> None:
+    """Raise ValueError unless they are counts for ``repeated``."""
+    if not 1 <= iterations <= first:
+        raise ValueError(
+            f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
+        )
