@@ -7,13 +7,14 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from coloc_env.datasets import euroc, hanyang, miluv, mrclam, tuc
+from coloc_env.datasets import euroc, hanyang, miluv, mrclam, tiers, tuc
 from coloc_env.datasets.euroc import load_euroc
 from coloc_env.datasets.files import DataError, data_root, dataset_folder
 from coloc_env.datasets.hanyang import load_hanyang
 from coloc_env.datasets.miluv import load_miluv
 from coloc_env.datasets.mrclam import load_mrclam
 from coloc_env.datasets.recording import Recording, Table, Track
+from coloc_env.datasets.tiers import load_tiers
 from coloc_env.datasets.tuc import load_tuc
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "load_hanyang",
     "load_miluv",
     "load_mrclam",
+    "load_tiers",
     "load_tuc",
     "sequences",
 ]
@@ -58,6 +60,7 @@ _DATASETS = {
     "miluv": _Dataset(load_miluv, _folders(miluv.robots_in)),
     "tuc": _Dataset(load_tuc, tuc.sequences_in),
     "hanyang": _Dataset(load_hanyang, hanyang.sequences_in),
+    "tiers": _Dataset(load_tiers, tiers.sequences_in),
 }
 DATASETS = tuple(_DATASETS)
 

@@ -23,8 +23,13 @@ HOMES = {
     "miluv": "https://github.com/decargroup/miluv",
     "tuc": "https://github.com/TUC-ProAut/libRSF",
     "hanyang": "https://doi.org/10.5281/zenodo.15226105",
+    "tiers": "https://github.com/TIERS/uwb-cooperative-mrs-localization",
 }
-_FOLDERS = {"tuc": "tuc_indoor_uwb", "hanyang": "hanyang_outdoor_uwb"}  # where not the name
+_FOLDERS = {  # where not the name
+    "tuc": "tuc_indoor_uwb",
+    "hanyang": "hanyang_outdoor_uwb",
+    "tiers": "tiers_mrs",
+}
 _CACHE_VERSION = 1
 
 

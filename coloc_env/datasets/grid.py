@@ -31,7 +31,7 @@ class Grid:
     def step_of(self, time: Stamps) -> NDArray[np.int64]:
         """The step that delivers a measurement of each time; −1 or T for times outside."""
         step = np.searchsorted(self.times, time, side="left")
-        return np.where(time < self.start - round(self.dt * 1e9), -1, step)
+        return np.where(time <= self.start - round(self.dt * 1e9), -1, step)
 
 
 def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Grid:

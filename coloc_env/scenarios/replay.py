@@ -6,7 +6,7 @@ The data are their owners' and not part of this package: see ``coloc_env.dataset
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -59,9 +59,9 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
 
 
 @lru_cache(maxsize=4)
-def loaded(name: str, sequence: str | None, data: str | None) -> Recording:
+def loaded(name: str, sequence: str | None, data: str | None, **options: Any) -> Recording:
     """A recording, kept for the next scenario made of it."""
-    return load(name, sequence, data)
+    return load(name, sequence, data, **options)
 
 
 @register("replay-mrclam-v0")

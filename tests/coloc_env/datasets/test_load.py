@@ -84,7 +84,7 @@ def test_which_is_loaded(data: Path, name: str, sequence: str | None, loaded: st
 @pytest.mark.parametrize(
     ("name", "sequence", "reason"),
     [
-        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv, tuc, hanyang"),
+        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv, tuc, hanyang, tiers"),
         ("mrclam", "d", "no sequence 'd' in .*mrclam, there are: a, b, c"),
         ("mrclam", "a,b", "one sequence at a time, not a,b"),
         ("euroc", "V1_01,V9", "no sequence 'V9'"),
