@@ -1,5 +1,6 @@
 """Who hears whom: radius, occlusion, message loss, and which neighbours a UAV has slots for."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,12 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Box
-from coloc_env.sensors.base import require
+from coloc_env.sensors.base import in_slots, require, squared_norm
+from coloc_env.walls import depth
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
+_SHADOWING = 4.0  # dB, standard deviation: IEEE 802.15.4a channel model, office without sight, 3.9
+_PER_DECIBEL = math.log(10) / 10  # what makes a power's ratio of decibels
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,10 @@ class Network:
     """Radio between UAVs.
 
     ``radius``: reach in m (None: everybody). ``walls``: solid boxes ((low), (high)) in m that block
-    the line of sight. ``loss``: probability that one directed link carries nothing in one step.
+    the line of sight; with a finite ``wall_loss``, in dB per metre inside them, a signal gets
+    through as long as it is then no weaker than one that comes in sight from ``radius`` m (power
+    falls with the square of the distance), give or take a shadowing of N(0, 4²) dB, drawn once per
+    pair and step. ``loss``: probability that one directed link carries nothing in one step.
     ``failure``: probability that a link is broken in one step: neither ranges nor messages pass,
     either way.
     ``delay``: further steps a message needs beyond the one it always takes. ``max_neighbours``:
@@ -33,6 +40,7 @@ class Network:
     delay: int = 0
     max_neighbours: int = 16
     failure: float = 0.0
+    wall_loss: float = math.inf
 
     def __post_init__(self) -> None:
         require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
@@ -40,6 +48,9 @@ class Network:
         require(0 <= self.failure <= 1, self, "failure", "a probability in [0, 1]")
         require(self.delay >= 0, self, "delay", "a number of steps ≥ 0")
         require(self.max_neighbours >= 1, self, "max_neighbours", "at least one slot")
+        require(self.wall_loss >= 0, self, "wall_loss", "a loss in dB per metre ≥ 0")
+        known = self.wall_loss == math.inf or self.radius is not None
+        require(known, self, "wall_loss", "infinite, unless there is a radius")
 
     def slots(self, n_uavs: int) -> int:
         """Neighbour slots of every UAV: its own index included where each UAV has one."""
@@ -60,8 +71,8 @@ class Network:
             reach.diagonal(dim1=-2, dim2=-1).fill_(False)
             if self.radius is not None:
                 reach &= _squared_distances(position) <= self.radius**2
-            if self.walls:
-                reach &= ~self._blocked(position.unsqueeze(3), position.unsqueeze(2))
+            if self._opaque:
+                reach &= ~(depth(position.unsqueeze(3), position.unsqueeze(2), self.walls) > 0)
             return index, reach
         pairs = _BLOCK if position.device.type == "cpu" else alive.numel() * n
         block = max(1, pairs // (n * n))
@@ -84,8 +95,8 @@ class Network:
             squared.addcmul_(apart, apart)
         squared.diagonal(dim1=-2, dim2=-1).fill_(float("inf"))
         squared.masked_fill_(~alive.unsqueeze(1), float("inf"))
-        if self.walls:
-            blocked = self._blocked(position.unsqueeze(2), position.unsqueeze(1))
+        if self._opaque:
+            blocked = depth(position.unsqueeze(2), position.unsqueeze(1), self.walls) > 0
             squared.masked_fill_(blocked, float("inf"))
         # A non-negative float32 orders like its bits read as an integer; the index makes it unique.
         order = squared.view(torch.int32).to(torch.int64).bitwise_left_shift_(20)
@@ -96,37 +107,48 @@ class Network:
         reach = (distance <= limit) & (distance < float("inf")) & alive.unsqueeze(-1)
         return order & 0xFFFFF, reach
 
-    def _blocked(
-        self, start: Float64[Tensor, "*#s d"], end: Float64[Tensor, "*#s d"]
-    ) -> Bool[Tensor, "*s"]:
-        """Whether the segment between two points passes through a wall (slab method)."""
-        blocked = None
-        for low, high in self.walls:
-            span = end - start
-            span = torch.where(span.abs() < 1e-12, 1e-12, span)
-            first = (start.new_tensor(low) - start) / span
-            second = (start.new_tensor(high) - start) / span
-            enter = torch.minimum(first, second).amax(-1).clamp_min(0.0)
-            leave = torch.maximum(first, second).amin(-1).clamp_max(1.0)
-            hit = enter < leave
-            blocked = hit if blocked is None else blocked | hit
-        assert blocked is not None
-        return blocked
+    @property
+    def _opaque(self) -> bool:
+        """Whether nothing at all gets through the walls."""
+        return bool(self.walls) and self.wall_loss == math.inf
 
     def unbroken(
         self,
         keys: Int64[Tensor, "R K"],
         neighbours: Int64[Tensor, "#R #K N S"],
         reach: Bool[Tensor, "R K N S"],
+        position: Float64[Tensor, "R K N d"],
     ) -> Bool[Tensor, "R K N S"]:
-        """``reach`` without the links that are broken in each step, the same ones at both ends."""
-        if not self.failure:
+        """``reach`` without the links that are broken in each step, and those that do not get
+        through a wall: the same ones at both ends."""
+        fading = bool(self.walls) and not self._opaque
+        if not (self.failure or fading):
             return reach
         n = reach.shape[2]
         own = torch.arange(n, device=keys.device).unsqueeze(-1)
         pair = torch.minimum(own, neighbours) * n + torch.maximum(own, neighbours)
         undirected = noise.fold(keys[..., None, None], pair)
-        return reach & (noise.uniform(undirected, "network.failure", 1)[..., 0] >= self.failure)
+        if self.failure:
+            whole = noise.uniform(undirected, "network.failure", 1)[..., 0] >= self.failure
+            reach = reach & whole
+        return reach & self._through(undirected, neighbours, position) if fading else reach
+
+    def _through(
+        self,
+        keys: Int64[Tensor, "R K N S"],
+        neighbours: Int64[Tensor, "#R #K N S"],
+        position: Float64[Tensor, "R K N d"],
+    ) -> Bool[Tensor, "R K N S"]:
+        """Which links are in sight, or strong enough to get through the walls between."""
+        assert self.radius is not None
+        own, other = position.unsqueeze(3), in_slots(position, neighbours)
+        inside = depth(own, other, self.walls)
+        if not bool((inside > 0).any()):
+            return torch.ones_like(inside, dtype=torch.bool)
+        apart = squared_norm(own - other)
+        shadowing = _SHADOWING * noise.normal(keys, "network.shadowing", 1)[..., 0]
+        loss = (_PER_DECIBEL * (self.wall_loss * inside + shadowing)).exp()
+        return (inside == 0) | (apart * loss <= self.radius**2)
 
     def links(
         self,

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from coloc_env.motion import Arena, Motion
 from coloc_env.network import Network
+from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor
 from coloc_env.sensors.base import Layout, require
 
@@ -123,7 +124,8 @@ class Scenario:
 
     ``failure_rate``: probability that a UAV fails, at a uniformly drawn step, during an episode;
     ``failures``: ((uav, step), …) for failures at given steps. ``reward``: one of ``REWARDS``.
-    ``guides``: the first so many UAVs know where they are and are not scored.
+    ``guides``: the first so many UAVs know where they are and are not scored. ``reference``: what
+    is to be reported beside the truth as if it were the truth (None: nothing).
     """
 
     name: str
@@ -140,6 +142,7 @@ class Scenario:
     failures: tuple[tuple[int, int], ...] = ()
     reward: str = "error"
     guides: int = 0
+    reference: SatelliteReference | None = None
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -159,7 +159,7 @@ def sense(
     fails_at = fails_at.unsqueeze(1)
     alive = steps.unsqueeze(-1) < fails_at
     neighbours, reach = network.neighbours(motion.position, alive)
-    reach = network.unbroken(step_keys, neighbours, reach)
+    reach = network.unbroken(step_keys, neighbours, reach, motion.position)
     window = Window(
         layout=scenario.layout,
         rows=keys,

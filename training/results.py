@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
@@ -93,6 +94,15 @@ class Results:
         sides = [b - a for a, b in zip(arena.low, arena.high, strict=True)]
         return metrics.LOST_SHARE * max(sides)
 
+    @cached_property
+    def reference(self) -> Floats | None:
+        """What the scenario's reference says less the truth [R, K, N, d], m; None without one."""
+        if self.scenario.reference is None:
+            return None
+        seeds = torch.arange(self.seed, self.seed + self.runs)
+        _, steps, n_uavs, dim = self.truth.shape
+        return self.scenario.reference.errors(seeds, steps, n_uavs, dim, self.dt)
+
     def diverged(self, agent: str) -> Flags:
         """[R]: runs in which a UAV ends lost or an estimate was not finite."""
         one = self.agents[agent]
@@ -163,6 +173,13 @@ class Results:
             figures["fge"] = metrics.formation_error(self.truth, one.offset, scored)
         if self.scenario.network.radius is not None:
             figures["nrmse"] = metrics.rmse(one.error, scored) / self.scenario.network.radius
+        if self.reference is not None:
+            apart = one.offset - self.reference
+            error = np.linalg.norm(apart, axis=-1)
+            figures["ate_reference"] = metrics.ate(error, scored)
+            if self.scenario.arena.n_uavs > 1:
+                standing = self.truth + self.reference
+                figures["fge_reference"] = metrics.formation_error(standing, apart, scored)
         undefined = float(np.isnan(one.nees[scored]).mean()) if errors.size else 0.0
         if undefined:
             figures["nees_undefined_share"] = undefined

@@ -31,6 +31,7 @@ from coloc_env.sensors import (
     UavBearings,
 )
 from coloc_env.sensors.ranging import Tags, tag_positions
+from coloc_env.walls import depth
 
 SHARED = (Ranging, UavBearings)  # sensors between UAVs
 
@@ -127,15 +128,20 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
     """d = ‖p_i + R_i l_a − p_j − R_j l_b‖ + noise: one draw that both ends read, counted once.
 
     Over the tags' positions this is a Laplacian with u uᵀ for weights, u the unit vector along a
-    link; the tags' Jacobians take it to the poses.
+    link; the tags' Jacobians take it to the poses. Which links pass through walls, how much too
+    long these make a range, and the clocks' errors count as known: no estimator knows more.
     """
     t = sensor.n_tags
     arrived = _mask(seen, "range_mask").unflatten(-1, (-1, t * t))
     links = _by_uav(arrived, seen).unflatten(-1, (t, t)).transpose(2, 3)  # [B, i, a, j, b]
     links = links.flatten(1, 2).flatten(2, 3)
-    links = torch.maximum(links, links.transpose(1, 2)) * range_information(sensor.noise)
     tags, jacobian = _tags(truth, sensor.tags)
     points = tags.flatten(1, 2)
+    told = torch.full_like(links, range_information(sensor.noise))
+    if sensor.walls:
+        blocked = depth(points.unsqueeze(2), points.unsqueeze(1), sensor.walls) > 0
+        told[blocked] = range_information(replace(sensor.noise, nlos=1.0))
+    links = torch.maximum(links, links.transpose(1, 2)) * told
     along = _unit(points.unsqueeze(2) - points.unsqueeze(1))
     weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)
     laplacian = -weights

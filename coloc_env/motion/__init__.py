@@ -7,14 +7,17 @@ position, in closed form. Positions in m, times in s, angles in rad, z up.
 
 from coloc_env.motion.aggressive import Aggressive
 from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
+from coloc_env.motion.court import Court
 from coloc_env.motion.curves import Circle, FigureEight, Helix
 from coloc_env.motion.formation import FormationChange
 from coloc_env.motion.kidnapped import Kidnapped
 from coloc_env.motion.lanes import Line, Square
+from coloc_env.motion.patrol import Patrol
 from coloc_env.motion.random_circles import RandomCircles
 from coloc_env.motion.random_helices import RandomHelices
 from coloc_env.motion.random_velocity import RandomVelocity
 from coloc_env.motion.recorded import Recorded
+from coloc_env.motion.split import Split
 from coloc_env.motion.stop_and_go import StopAndGo
 from coloc_env.motion.waypoints import Waypoints
 from coloc_env.motion.weave import Weave
@@ -40,6 +43,7 @@ __all__ = [
     "Box",
     "Carry",
     "Circle",
+    "Court",
     "FigureEight",
     "FormationChange",
     "Helix",
@@ -47,10 +51,12 @@ __all__ = [
     "Kinematics",
     "Line",
     "Motion",
+    "Patrol",
     "RandomCircles",
     "RandomHelices",
     "RandomVelocity",
     "Recorded",
+    "Split",
     "Square",
     "StopAndGo",
     "Waypoints",

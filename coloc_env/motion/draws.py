@@ -1,5 +1,6 @@
 """What motions draw: keys per UAV, uniform points, and constants kept on their device."""
 
+import math
 from functools import lru_cache
 
 import torch
@@ -7,6 +8,8 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
+
+GOLDEN = 0.5 * (math.sqrt(5) - 1)  # whose multiples, modulo 1, are never near those just before
 
 
 @lru_cache(maxsize=256)

@@ -8,13 +8,12 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.motion.draws import phases
+from coloc_env.motion.draws import GOLDEN, phases
 from coloc_env.motion.fit import altitude, at_most, half_extents, positive
 from coloc_env.motion.frames import level_flight
 from coloc_env.motion.timing import StopAndGoLaw, alternating, cycles, seconds
 
 _SPEED = 0.5
-_GOLDEN = 0.5 * (math.sqrt(5) - 1)
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Line(Motion):
         height, spread = altitude(self, arena, self.height), 0.0
         if arena.dim == 3 and self.height is None:
             spread = halves[2]
-        mixed = cycles(_GOLDEN * arena.n_uavs * share)[1]
+        mixed = cycles(GOLDEN * arena.n_uavs * share)[1]
         return {
             "legs": 2 * share,
             "y": arena.centre[1] + halves[1] * (2 * share + 1 / arena.n_uavs - 1),

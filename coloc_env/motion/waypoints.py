@@ -60,15 +60,7 @@ class Waypoints(Motion):
             start, end, ahead, after = self._random_legs(carry["keys"], leg.long(), arena)
         else:
             start, end, ahead, after = _route_legs(self.route, leg.long())
-        time = fraction * period
-        covered, rate = minimum_jerk(time / flight)
-        turned, _ = minimum_jerk((time - flight) / self.pause)
-        leap = end - start
-        truth = Kinematics(
-            start + covered.unsqueeze(-1) * leap,
-            (rate / flight).unsqueeze(-1) * leap,
-            yaw_attitude(*_turn(ahead, after, turned), arena.dim),
-        )
+        truth = leg_flight(start, end, (ahead, after), fraction * period, flight, self.pause)
         return truth, carry
 
     def _random_legs(
@@ -92,6 +84,26 @@ class Waypoints(Motion):
         if self.duration is not None:
             return self.duration
         return MINIMUM_JERK_SPEED * self._longest(arena) / self.max_speed
+
+
+def leg_flight(
+    start: Float64[Tensor, "R K N d"],
+    end: Float64[Tensor, "R K N d"],
+    directions: tuple[Float64[Tensor, "R K N 2"], Float64[Tensor, "R K N 2"]],
+    time: Float64[Tensor, "R K N"],
+    flight: float,
+    pause: float,
+) -> Kinematics:
+    """``time`` s into a minimum-jerk flight of ``flight`` s from point to point and the ``pause``
+    after it, in which the yaw turns from this leg's direction to the next one's."""
+    covered, rate = minimum_jerk(time / flight)
+    turned, _ = minimum_jerk((time - flight) / pause)
+    leap = end - start
+    return Kinematics(
+        start + covered.unsqueeze(-1) * leap,
+        (rate / flight).unsqueeze(-1) * leap,
+        yaw_attitude(*_turn(*directions, turned), start.shape[-1]),
+    )
 
 
 def _check_route(route: tuple[Point, ...], arena: Arena) -> None:

@@ -1,5 +1,6 @@
 """Scenario families, one short file each; importing this package registers them all."""
 
+from coloc_env.scenarios import campus as _campus  # noqa: F401
 from coloc_env.scenarios import indoor as _indoor  # noqa: F401
 from coloc_env.scenarios import replay as _replay  # noqa: F401
 from coloc_env.scenarios import replay_anchors as _replay_anchors  # noqa: F401

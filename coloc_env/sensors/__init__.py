@@ -2,6 +2,7 @@
 
 from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
+from coloc_env.sensors.clock import Clock
 from coloc_env.sensors.height import Height
 from coloc_env.sensors.imu import GRAVITY, Imu
 from coloc_env.sensors.ins import Ins
@@ -15,6 +16,7 @@ from coloc_env.sensors.slow_flight import SlowFlight
 __all__ = [
     "GRAVITY",
     "AnchorRanging",
+    "Clock",
     "Height",
     "Imu",
     "Ins",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped
 from torch import Tensor
 
 from coloc_env import noise
@@ -150,6 +150,17 @@ def require(condition: bool, owner: Any, name: str, allowed: str) -> None:
         kind = type(owner).__name__ if not isinstance(owner, str) else owner
         value = getattr(owner, name, None)
         raise ValueError(f"{kind}: {name}={value!r} is not allowed: {allowed}")
+
+
+def in_slots(
+    values: Shaped[Tensor, "R K N *f"], neighbours: Int64[Tensor, "#R #K N S"]
+) -> Shaped[Tensor, "R K #N S *f"]:
+    """What belongs to the UAV in each neighbour slot; one row for all where slot j is UAV j."""
+    if neighbours.shape[-1] == values.shape[2]:
+        return values.unsqueeze(2)
+    rows = torch.arange(values.shape[0], device=values.device)[:, None, None, None]
+    steps = torch.arange(values.shape[1], device=values.device)[:, None, None]
+    return values[rows, steps, neighbours]
 
 
 def squared_norm(x: Float64[Tensor, "*s d"]) -> Float64[Tensor, "*s"]:

@@ -89,8 +89,11 @@ class RangeNoise:
             size = torch.full_like(error, self.nlos_bias)
             if self.nlos_kind == "exponential":
                 size = size * -draw("nlos.size").log()
-            late = chance(self.nlos, "nlos") if obstructed is None else obstructed
-            late = late if blocked is None else late | blocked
+            if self.nlos or blocked is None:
+                late = chance(self.nlos, "nlos") if obstructed is None else obstructed
+                late = late if blocked is None else late | blocked
+            else:
+                late = blocked
             error = error + torch.where(late, size, 0.0)
         if self.impulse:
             size = (2 * draw("impulse.size") - 1) * self.impulse_size

@@ -1,5 +1,6 @@
 """UWB ranging: between UAVs, and from UAVs to fixed anchors."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -8,9 +9,20 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotate
-from coloc_env.motion import Kinematics
-from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
+from coloc_env.motion import Box, Kinematics
+from coloc_env.sensors.base import (
+    MASK,
+    Layout,
+    Leaf,
+    Sensor,
+    Window,
+    in_slots,
+    require,
+    squared_norm,
+)
+from coloc_env.sensors.clock import Clock
 from coloc_env.sensors.range_noise import RangeNoise
+from coloc_env.walls import depth
 
 Tags = tuple[tuple[tuple[float, ...], ...], ...]
 
@@ -24,18 +36,15 @@ def tag_positions(motion: Kinematics, tags: Tags) -> Float64[Tensor, "R K N T d"
 
 
 def tag_distances(
-    tags: Float64[Tensor, "R K N T d"], others: Int64[Tensor, "R K N S"] | None
+    tags: Float64[Tensor, "R K N T d"], neighbours: Int64[Tensor, "#R #K N S"]
 ) -> Float32[Tensor, "R K N S T T"]:
-    """Distances between own tags and the tags of the UAV in each slot (None: slot j is UAV j).
+    """Distances between own tags and the tags of the UAV in each slot.
 
     Subtracted in float64, one component at a time; then float32 is exact enough.
     """
-    if others is not None:
-        rows = torch.arange(tags.shape[0], device=tags.device)[:, None, None, None]
-        steps = torch.arange(tags.shape[1], device=tags.device)[:, None, None]
     squared = None
     for own in tags.unbind(-1):
-        theirs = own.unsqueeze(2) if others is None else own[rows, steps, others]
+        theirs = in_slots(own, neighbours)
         apart = (own[:, :, :, None, :, None] - theirs.unsqueeze(-2)).to(torch.float32)
         squared = apart.mul_(apart) if squared is None else squared.addcmul_(apart, apart)
     assert squared is not None
@@ -49,15 +58,21 @@ class Ranging(Sensor):
     Entry ``(s · T + a) · T + b`` is between the UAV's own tag ``a`` and tag ``b`` of the neighbour
     in slot ``s`` (T = 1 and no lever arm where ``tags`` is empty). Both ends of a link read the
     same number, drawn once per pair, tags and step. ``latency``: steps between ranging and
-    delivery.
+    delivery. ``walls``: solid boxes; a range that comes through one (if it does: see ``Network``)
+    has the noise's NLOS bias and is too long by ``excess`` times the metres inside. ``clock``: the
+    systematic errors of each pair (None: none).
     """
 
     noise: RangeNoise = field(default_factory=RangeNoise)
     tags: Tags = ()
     latency: int = 0
+    walls: tuple[Box, ...] = ()
+    excess: float = 0.0
+    clock: Clock | None = None
 
     def __post_init__(self) -> None:
         require(self.latency >= 0, self, "latency", "a number of steps ≥ 0")
+        require(0 <= self.excess < math.inf, self, "excess", "metres per metre of wall, ≥ 0")
 
     @property
     def delay(self) -> int:
@@ -71,6 +86,9 @@ class Ranging(Sensor):
         width = layout.slots * self.n_tags**2
         return {"ranges": Leaf(width), "range_mask": Leaf(width, *MASK)}
 
+    def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
+        return {} if self.clock is None else self.clock.place(keys, layout.arena.n_uavs)
+
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion, keys = window.delayed(self.latency)
         tags, n, t = tag_positions(motion, self.tags), window.layout.arena.n_uavs, self.n_tags
@@ -78,14 +96,24 @@ class Ranging(Sensor):
         index = torch.arange(n * t, device=keys.device).view(n, 1, t, 1)
         other = others[..., None, None] * t + torch.arange(t, device=keys.device)
         lower, upper = torch.minimum(index, other), torch.maximum(index, other)
-        distance = tag_distances(tags, None if others.shape[-1] == n else others)
+        distance = tag_distances(tags, others)
         link = noise.fold(keys[..., None, None, None, None], lower * (n * t) + upper)
         pairs = torch.arange(n * t * (n * t + 1) // 2, device=keys.device)
         obstructed = self.noise.obstructed(window, pairs, "ranging", self.latency)
         if obstructed is not None:
             among = (upper * (upper + 1) // 2 + lower).expand(distance.shape)
             obstructed = obstructed.gather(2, among.flatten(2)).view(distance.shape)
-        ranges, lost = self.noise.sample(distance, link, "ranging", obstructed=obstructed)
+        blocked = None
+        if self.walls:
+            own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
+            inside = depth(own, theirs, self.walls).to(torch.float32)
+            blocked = inside > 0
+        ranges, lost = self.noise.sample(distance, link, "ranging", blocked, obstructed)
+        if blocked is not None:
+            ranges = ranges.add_(inside, alpha=self.excess)
+        if self.clock is not None:
+            late = self.clock.errors(window, window.steps - self.latency, placed)
+            ranges.add_(late[..., None, None])
         mask = window.reach[..., None, None].expand(ranges.shape)
         if self.latency:
             mask = mask & (window.steps >= self.latency)[..., None, None, None, None]

@@ -78,6 +78,7 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "tags": tags,
     "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, dropout=0.2),
     "swarm": lambda: make_scenario("swarm-v0", n_uavs=8, anchors=0.4, nlos_time=3.0),
+    "campus": lambda: make_scenario("campus-v0", flight="s3", dt=0.5),
 }
 ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
@@ -99,17 +100,18 @@ CHOSEN = {
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "tags", "wsn"),
     "nnhpff": ("anchors", "tags", "wsn"),
-    **dict.fromkeys(("dwmds_st", "map"), ("nlos", "anchors", "slots", "swarm")),
+    **dict.fromkeys(("dwmds_st", "map"), ("nlos", "anchors", "slots", "swarm", "campus")),
     **dict.fromkeys(("mds", "dwmds", "vmds"), ("nlos", "anchors", "slots")),
     "fcmds": ("anchors", "slots"),
     "gn": ("slots",),
 }
-ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm")]
+ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm", "campus")]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE) if n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
     *((n, "wsn") for n in ("pf", "ekf")),
     *((n, "swarm") for n in ("dead_reckoning", "ekf", "ekf_joint", "pf", "ekf:robust=huber")),
+    *((n, "campus") for n in ("dead_reckoning", "mds", "gn")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]

@@ -102,6 +102,35 @@ CHANGED: dict[str, dict[str, Any]] = {
         "failure_rate": 1.0,
         "reward": "squared",
     },
+    "campus-v0": {
+        "flight": "s1",
+        "n_uavs": 7,
+        "dt": 0.05,
+        "horizon": 17,
+        "anchors": 0.6,
+        "anchor_std": 2.0,
+        "uwb_std": 5.0,
+        "believed_uwb_std": 0.5,
+        "wall_loss": 0.0,
+        "wall_excess": 0.5,
+        "nlos": 0.5,
+        "nlos_bias": 40.0,
+        "nlos_kind": "constant",
+        "uwb_dropout": 0.5,
+        "clock_offset": 0.9,
+        "clock_skew": 0.9,
+        "ins_std": 1.0,
+        "ins_bias": 1.0,
+        "ins_bias_time": 5.0,
+        "comm_radius": 10.0,
+        "link_failure": 0.5,
+        "message_loss": 0.5,
+        "message_delay": 1,
+        "prior_std": 9.0,
+        "failure_rate": 1.0,
+        "gps_cep": 1.5,
+        "reward": "squared",
+    },
 }
 # Overrides that show only together with another.
 WITH: dict[str, dict[str, dict[str, Any]]] = {
@@ -120,6 +149,13 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "uwb_tail_std": {"uwb_tail": 0.5},
         "failure_rate": {"horizon": 4},
     },
+    "campus-v0": {
+        "nlos_bias": {"nlos": 0.5},
+        "nlos_kind": {"nlos": 0.5},
+        "wall_loss": {"flight": "s3"},
+        "wall_excess": {"flight": "s3", "wall_loss": 0.0},
+        "failure_rate": {"horizon": 4},
+    },
 }
 SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchors": 0.3, "nlos": 0.4}}
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
@@ -136,7 +172,7 @@ def told(family: str, **overrides: Any) -> tuple[Any, ...]:
             {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
         )
         seen = world.observation()
-    return brought, scenario.horizon, scenario.believed
+    return brought, scenario.horizon, scenario.believed, scenario.reference
 
 
 @pytest.mark.parametrize("family", CHANGED)

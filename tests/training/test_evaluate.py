@@ -1,6 +1,7 @@
 """Evaluation: the schema, pairing, repeatability, and what goes wrong is counted."""
 
 import copy
+import dataclasses
 import json
 import math
 from typing import Any
@@ -157,6 +158,29 @@ def test_figures_that_do_not_apply_are_null() -> None:
     assert only["diagnostics"]["nees_undefined_share"] == 1
     assert only["diagnostics"]["nrmse"] == pytest.approx(only["rmse"] / 5)
     assert not {"fge", "relative_error"} & only["diagnostics"].keys()
+
+
+def test_errors_are_measured_from_the_reference_too() -> None:
+    """A UAV that says just what its reference does has no error from it; the truth has."""
+    scene = make_scenario("campus-v0", n_uavs=4, anchors=0.0, horizon=8, gps_cep=2.0)
+    results = evaluate(scene, ["dead_reckoning"], runs=2, seed=5, bound=False)
+    (agent,) = results.agents.values()
+    assert results.reference is not None
+    assert scene.reference is not None
+    again = scene.reference.errors(torch.tensor([6]), 8, 4, 3, 0.1)
+    np.testing.assert_array_equal(results.reference[1:], again)
+    told = {}
+    for name, offset in (("reference", results.reference), ("truth", np.zeros_like(agent.offset))):
+        posing = dataclasses.replace(agent, offset=offset)
+        changed = dataclasses.replace(results, agents={name: posing})
+        told[name] = changed.summary["agents"][name]["diagnostics"]
+    assert told["reference"]["ate_reference"] == pytest.approx(0.0)
+    assert told["reference"]["fge_reference"] == pytest.approx(0.0)
+    assert told["truth"]["fge"] == pytest.approx(0.0)
+    apart = np.linalg.norm(results.reference, axis=-1)
+    assert told["truth"]["ate_reference"] == pytest.approx(np.sqrt((apart**2).mean(1)).mean())
+    assert told["truth"]["fge_reference"] == pytest.approx(told["reference"]["fge"])
+    assert told["truth"]["fge_reference"] > 0.5
 
 
 def test_unscored_steps_do_not_count() -> None:
