@@ -101,7 +101,8 @@ def replay_tiers(
     another, settle the first two; the last is settled by the prior, and by robots with known
     velocities that drive curves. With one guide the turn, too, shows only in how robots move, and
     range errors of this recording's kind, which last, hide it (on its first 60 s the joint EKF is
-    off by 0.50 m RMS with one guide, by 0.13 with two). With three guides nothing is left open.
+    off by 0.50 m RMS with one guide, by 0.13 with two). With three guides one place
+    fits best, but methods with a prior that is metres off may settle on the other side of them.
 
     ``calibrated``: each pair's ranges are made shorter by their median error in the recording's
     first ``calibration`` s, by OptiTrack, whatever ``span`` is flown; not ``calibrated``, they are
