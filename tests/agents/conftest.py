@@ -111,7 +111,7 @@ CASES = [
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
     *((n, "wsn") for n in ("pf", "ekf")),
     *((n, "swarm") for n in ("dead_reckoning", "ekf", "ekf_joint", "pf", "ekf:robust=huber")),
-    *((n, "campus") for n in ("dead_reckoning", "mds", "gn")),
+    ("dead_reckoning", "campus"),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]
