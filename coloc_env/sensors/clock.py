@@ -21,9 +21,9 @@ class Clock:
     the crystal's temperature: a sine whose period is drawn once, between a half and twice
     ``period`` s, so that |s| ≤ ``skew``.
 
-    Magnitudes: a DW1000's antenna delay is off by 10 to 50 cm uncalibrated and by some cm to 20 cm
-    calibrated; 1 ppm after correction for the clocks' measured offset and T = 0.5 ms make 7.5 cm
-    (Decawave application note APS011, "Sources of error in DW1000 based two-way ranging").
+    The defaults are choices: some decimetres of antenna delay left by calibration; 1 ppm left of
+    the frequency errors and T = 0.5 ms make 7.5 cm by the formula above (Decawave application note
+    APS011, "Sources of error in DW1000 based two-way ranging", on ranging with clock drift).
     """
 
     offset: float = 0.2
