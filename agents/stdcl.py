@@ -13,6 +13,7 @@ from agents.dwmds import DynamicMds
 from agents.localizer import Estimate, Localizer, register
 from agents.stgnn.features import Memory, Scene, along_links, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
+from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
 from agents.swarm.links import lengths
 from agents.tensorclasses import build
@@ -133,11 +134,13 @@ def _owed(
 
 def _corrected(now: Prepared, found: Found, correction: Correction) -> Found:
     """p̂ = p + γ Δp (eq. 34) and its variance; who is fixed stays."""
+    moves = ~now.fixed
     position = found.position + correction.offset.double()
-    variance = found.variance * correction.spread.double()
+    variance = torch.where(moves, found.variance * correction.spread.double(), found.variance)
     return Found(
-        torch.where(now.fixed.unsqueeze(-1), found.position, position),
-        torch.where(now.fixed, found.variance, variance),
+        torch.where(moves.unsqueeze(-1), position, found.position),
+        variance,
+        None if found.joint is None else joint.scaled(found.joint, variance),
     )
 
 
@@ -160,7 +163,7 @@ class StDcl(NetworkLoop):
         feedback: Feedback = "learned",
         confidence: Confidence = "em",
     ) -> None:
-        base = DynamicMds(believed, confidence=confidence)
+        base = DynamicMds(believed, confidence=confidence, covariance="axes")
         super().__init__(base, learned(StGnn, weights), feedback)
 
 

@@ -9,29 +9,29 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from agents.localizer import register
+from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
-from agents.swarm.gauss_newton import gauss_newton
+from agents.swarm.gauss_newton import fisher, gauss_newton
 from coloc_env.scenario import Believed
 
 
 class _Joint(SwarmFilter):
     """Gauss–Newton with ``iterations`` a step."""
 
-    def __init__(self, believed: Believed, confidence: Confidence, iterations: int) -> None:
-        super().__init__(believed, confidence)
+    def __init__(
+        self, believed: Believed, confidence: Confidence, iterations: int, bias: bool = False
+    ) -> None:
+        super().__init__(believed, confidence, bias)
         if iterations < 1:
             raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.iterations = iterations
 
     def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N d K"]:
-        b, n = variance.shape
-        d = self.process.dim
-        whole = torch.diag_embed(variance.repeat_interleave(d, -1))
-        return whole.view(b, n, d, n * d)
+        return joint.independent(variance, self.process.dim)
 
     def solved(self, now: Prepared, precision: Float64[Tensor, "B K K"]) -> Found:
         """Positions, and the inverse of their joint information."""
-        position, information = gauss_newton(
+        position, _ = gauss_newton(
             now.place,
             now.links.distance,
             lambda residual: self.weigh_residual(residual, now),
@@ -40,13 +40,11 @@ class _Joint(SwarmFilter):
             precision,
             self.iterations,
         )
-        joint = torch.cholesky_inverse(torch.linalg.cholesky_ex(information).L)
-        still = now.fixed.repeat_interleave(self.process.dim, -1)
-        known = torch.diag_embed(now.variance.repeat_interleave(self.process.dim, -1))
-        joint = torch.where(still.unsqueeze(-1) | still.unsqueeze(-2), known, joint)
-        joint = joint.unflatten(1, now.place.shape[1:])
-        variance = own_blocks(joint).diagonal(dim1=-2, dim2=-1).mean(-1)
-        return Found(position, variance, joint)
+        weight, _ = self.weigh(position, now)
+        told = fisher(position, self.told(weight, now)).flatten(3).flatten(1, 2)
+        together = joint.posterior(told + precision, now.fixed, now.variance)
+        variance = own_blocks(together).diagonal(dim1=-2, dim2=-1).mean(-1)
+        return Found(position, variance, together)
 
 
 @register("gn")
@@ -68,19 +66,19 @@ class Snapshot(_Joint):
 @register("map")
 class RecursiveMap(_Joint):
     """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
-    ``huber`` or ``none``, as ``dwmds_st`` has it."""
+    ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them."""
 
     name = "map"
 
     def __init__(
-        self, believed: Believed, *, confidence: Confidence = "em", iterations: int = 3
+        self,
+        believed: Believed,
+        *,
+        confidence: Confidence = "em",
+        iterations: int = 3,
+        bias: bool = True,
     ) -> None:
-        super().__init__(believed, confidence, iterations)
+        super().__init__(believed, confidence, iterations, bias)
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        covariance = belief.joint.flatten(1, 2).clone()
-        covariance.diagonal(dim1=-2, dim2=-1).add_(
-            now.added.repeat_interleave(self.process.dim, -1)
-        )
-        factor = torch.linalg.cholesky_ex(covariance).L
-        return self.solved(now, torch.cholesky_inverse(factor))
+        return self.solved(now, joint.precision(now.joint, now.fixed))

@@ -16,7 +16,7 @@ class SwarmAugmentation(Transform):
     """Links dropped at random, noise on fixes and velocities, mixed noise on ranges.
 
     Each link is dropped with probability 0.15 in each step, from both ends. Ranges of ``std`` m get
-    Gaussian, uniform and impulse noise besides, in a mixture that is drawn for each world of each
+    Gaussian, uniform and impulse noise besides, or some of them, as drawn for each world of each
     step; both ends of a link get the same. All is drawn from ``seed``.
     """
 
@@ -48,7 +48,9 @@ class SwarmAugmentation(Transform):
     def _noise(self, *shape: int) -> Tensor:
         """Noise of all pairs (m), [*, N, N]."""
         *worlds, n = shape
-        gaussian, uniform, impulse = 0.5 * self.std * self._uniform(3, *worlds, 1, 1)
+        mixed = (3, *worlds, 1, 1)
+        chosen = self._uniform(*mixed) < 0.5
+        gaussian, uniform, impulse = 0.5 * self.std * self._uniform(*mixed) * chosen
         pairs = (*worlds, n, n)
         hit = (self._uniform(*pairs) < _IMPULSES) * (2 * self._uniform(*pairs) - 1)
         return (

@@ -12,35 +12,51 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
-from agents.swarm import calibration, weights
-from agents.swarm.links import Links, lengths, links_of
+from agents.swarm import calibration, drift, joint, persistence, weights
+from agents.swarm.drift import Drift
+from agents.swarm.links import Links, connected, lengths, links_of
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
-from coloc_env.scenario import Believed
-from coloc_env.sensors import PositionFix, Ranging
+from coloc_env.scenario import Believed, InsDriven
+from coloc_env.sensors import Ins, PositionFix, Ranging
 
 UNKNOWN = 1e12  # m²: variance of a position of which nothing is known
-Confidence = Literal["none", "huber", "em"]
+Confidence = Literal["none", "huber", "em", "paper"]
+_ENOUGH = 50.0  # remembered errors of links between fixes: with fewer, all links' are learned from
 
 
 class SwarmBelief(TensorClass):
     """Dead-reckoned state with the position last found, that position's variance (m², per axis) and
-    its rows of the team's joint covariance (m²; none where a method has no use for it), steps
-    taken, and what is remembered of ranges' errors (the same for all); batch (B, N)."""
+    its rows of the team's joint covariance (``agents.swarm.joint``, m²; none where it is not kept);
+    the INS's bias (m/s) with its covariance with the position (m²/s) and its variance (m²/s²);
+    steps taken; and, the same for all, what is remembered of ranges' errors and of how links change
+    between clean and obstructed; of each link how likely it is obstructed (``paper``: how often it
+    was silent; none where that is not used); whether the UAV is ``localizable``: connected to so
+    many with fixes that they settle a position, d + 1. Batch (B, N)."""
 
     state: Float64[Tensor, "B N S"]
     variance: Float64[Tensor, "B N"]
-    joint: Float64[Tensor, "B N d K"]
+    joint: Float64[Tensor, "B N e K"]
+    bias: Float64[Tensor, "B N d"]
+    drift: Float64[Tensor, "B N 2"]
     step: Int64[Tensor, "B N"]
     errors: Float64[Tensor, "B N 2 3"]
+    chain: Float64[Tensor, "B N 2 2"]
+    memory: Float64[Tensor, "B N L"]
+    localizable: Bool[Tensor, "B N"]
 
 
 @dataclass(frozen=True)
 class Prepared:
     """What a step has to find positions from: everybody's dead-reckoned ``state``, its ``place`` by
     dead reckoning or fix (m), that place's ``variance`` (m² per axis) and what the step ``added``
-    to it, who is ``fixed``, the ``links``, the ``model`` of their errors, and by what factor each
-    link's weight is held down from outside (``confidence``, in [0, 1]; None: not at all)."""
+    to it, who is ``fixed``, the ``links``, the ``model`` of their errors; the variance that dead
+    reckoning alone has (``reckoned``), the joint covariance of the places (none where it is not
+    kept), the variance of the vectors ``between`` them (m² per axis), the INS's ``drift`` (None:
+    not estimated), how links change (``chain``), the probability that each is an ``outlier``
+    beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
+    and by what factor each link's weight is held down from outside (``confidence``, in [0, 1];
+    None: not at all)."""
 
     state: Float64[Tensor, "B N S"]
     place: Float64[Tensor, "B N d"]
@@ -49,6 +65,13 @@ class Prepared:
     fixed: Bool[Tensor, "B N"]
     links: Links
     model: calibration.ErrorModel
+    reckoned: Float64[Tensor, "B N"]
+    joint: Float64[Tensor, "B N e K"]
+    between: Float64[Tensor, "B N N"]
+    drift: Drift | None
+    chain: Float64[Tensor, "B 2 2"]
+    outlier: Float64[Tensor, "B N N"] | None = None
+    silent: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
 
 
@@ -58,7 +81,7 @@ class Found:
 
     position: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
-    joint: Float64[Tensor, "B N d K"] | None = None
+    joint: Float64[Tensor, "B N e K"] | None = None
 
 
 class SwarmFilter(Localizer[SwarmBelief]):
@@ -70,13 +93,16 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     centralized = True
 
-    def __init__(self, believed: Believed, confidence: Confidence) -> None:
+    def __init__(self, believed: Believed, confidence: Confidence, bias: bool = False) -> None:
+        """``bias``: estimate the INS's, where the team has one that it believes to be biased."""
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
         if sensor is None or sensor.tags:
             raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.confidence = confidence
+        ins = believed.sensor(Ins) if isinstance(believed.process, InsDriven) else None
+        self.ins = ins if bias and ins is not None and ins.bias > 0 else None
 
     @abstractmethod
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
@@ -90,19 +116,29 @@ class SwarmFilter(Localizer[SwarmBelief]):
         state, covariance = self.process.initial(observation["prior"].double())
         d, shape = self.process.dim, state.shape[:2]
         variance = covariance[..., :d, :d].diagonal(dim1=-2, dim2=-1).mean(-1)
-        errors = calibration.believed_model(len(state), self.std, state.device).sums
+        model = calibration.believed_model(len(state), self.std, state.device)
+        chain = persistence.believed_chain(model.share[:, 1])
+        width = shape[1] if self.confidence in ("em", "paper") else 0
+        usual = model.share[:, 1, None, None] if self.confidence == "em" else 0.0
+        drifting = 0.0 if self.ins is None else self.ins.bias**2
+        none = torch.zeros_like(variance)
         return SwarmBelief(
             state=state,
             variance=variance,
             joint=self.joint(variance),
+            bias=torch.zeros_like(state[..., :d]),
+            drift=torch.stack((none, none + drifting), -1),
             step=torch.zeros(shape, dtype=torch.int64, device=state.device),
-            errors=errors.unsqueeze(1).expand(-1, shape[1], -1, -1).contiguous(),
+            errors=_for_each(model.sums, shape),
+            chain=_for_each(chain, shape),
+            memory=variance.new_zeros(*shape, width) + usual,
+            localizable=torch.zeros(shape, dtype=torch.bool, device=state.device),
             batch_size=shape,
         )
 
-    def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N d K"]:
+    def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
         """The joint covariance of UAVs with nothing in common; nothing where it is not kept."""
-        return variance.new_zeros(*variance.shape, self.process.dim, 0)
+        return variance.new_zeros(*variance.shape, 1, 0)
 
     def step(self, belief: SwarmBelief, observation: Observation) -> tuple[SwarmBelief, Estimate]:
         now = self.prepared(belief, observation)
@@ -112,14 +148,46 @@ class SwarmFilter(Localizer[SwarmBelief]):
         """What a step has to find positions from."""
         d, dt = self.process.dim, elapsed(self.process, belief.step).double()
         u = self.process.inputs(observation)
+        if self.ins is None:
+            moving, kept = None, torch.ones_like(dt)
+            _, q = self.process.linearize(belief.state, u, dt)
+            added = q[..., :d, :d].diagonal(dim1=-2, dim2=-1).mean(-1)
+        else:
+            moving = drift.aged(Drift(belief.bias, *belief.drift.unbind(-1)), dt, self.ins)
+            u = u - moving.bias
+            moving, kept, added = drift.reckoned(moving, belief.variance, dt, self.ins)
         state = self.process.propagate(belief.state, u, dt)
-        _, q = self.process.linearize(belief.state, u, dt)
-        added = q[..., :d, :d].diagonal(dim1=-2, dim2=-1).mean(-1)
         fixed, place, spread = self._fixes(observation, state[..., :d])
-        variance = torch.where(fixed, spread, belief.variance + added)
+        reckoned = kept.square() * belief.variance + added
+        variance = torch.where(fixed, spread, reckoned)
+        if belief.joint.shape[-1]:
+            together = joint.carried(belief.joint, kept, added, fixed, spread)
+            between = joint.between(together)
+        else:
+            together = belief.joint
+            between = variance.unsqueeze(-1) + variance.unsqueeze(-2)
         links = links_of(observation)
-        model = self._learned(belief, links, place, fixed)
-        return Prepared(state, place, variance, added, fixed, links, model)
+        now = Prepared(
+            state,
+            place,
+            variance,
+            added,
+            fixed,
+            links,
+            calibration.ErrorModel(sums=belief.errors[:, 0], batch_size=belief.errors.shape[:1]),
+            reckoned,
+            together,
+            between,
+            moving,
+            belief.chain[:, 0],
+        )
+        if self.confidence == "em":
+            return self._learned(belief, now)
+        if self.confidence == "paper":
+            heard = (~links.mask).double()
+            silent = belief.memory + (heard - belief.memory) / calibration.FORGET
+            return replace(now, silent=silent)
+        return now
 
     def concluded(
         self, belief: SwarmBelief, now: Prepared, found: Found
@@ -127,19 +195,30 @@ class SwarmFilter(Localizer[SwarmBelief]):
         """The belief that goes on from what was found, and the estimate."""
         d, shape = self.process.dim, now.fixed.shape
         state = torch.cat((found.position, now.state[..., d:]), -1)
+        eye = torch.eye(d, dtype=state.dtype, device=state.device)
+        together, covariance = now.joint, found.variance[..., None, None] * eye
+        if found.joint is not None:
+            together, own = found.joint, own_blocks(found.joint)
+            covariance = own if own.shape[-1] == d else own * eye
+        bias, moments = belief.bias, belief.drift
+        if now.drift is not None:
+            moved = found.position - now.state[..., :d]
+            known = drift.informed(now.drift, moved, now.reckoned, found.variance)
+            bias, moments = known.bias, torch.stack((known.cross, known.variance), -1)
         after = build(
             SwarmBelief,
             shape,
             state=state,
             variance=found.variance,
-            joint=belief.joint if found.joint is None else found.joint,
+            joint=together,
+            bias=bias,
+            drift=moments,
             step=belief.step + 1,
-            errors=now.model.sums.unsqueeze(1).expand_as(belief.errors).contiguous(),
+            errors=_for_each(now.model.sums, shape),
+            chain=_for_each(now.chain, shape),
+            memory=self._remembered(belief, now, found),
+            localizable=_localizable(now, d),
         )
-        eye = torch.eye(d, dtype=state.dtype, device=state.device)
-        covariance = found.variance[..., None, None] * eye
-        if found.joint is not None:
-            covariance = own_blocks(found.joint)
         estimate = build(
             Estimate,
             shape,
@@ -150,14 +229,20 @@ class SwarmFilter(Localizer[SwarmBelief]):
         return after, estimate
 
     def diagnostics(self, belief: SwarmBelief) -> dict[str, Float64[Tensor, "B N"]]:
-        if self.confidence != "em":
-            return {}
-        model, shape = self._model(belief), belief.step.shape
-        mean, _ = model.component(self.std)
-        return {
-            "outlier_share": model.share[:, 1:].expand(shape),
-            "outlier_bias": mean[:, 1:].expand(shape),
-        }
+        """``localizable``; in calibrated ones what is believed of ranges: share, bias (m) and
+        persistence ρ of outliers; the size of the INS's bias (m/s) that is taken off."""
+        own = {"localizable": belief.localizable.double()}
+        if self.confidence == "em":
+            sums, shape = belief.errors[:, 0], belief.step.shape
+            model = calibration.ErrorModel(sums=sums, batch_size=sums.shape[:1])
+            mean, _ = model.component(self.std)
+            rho = persistence.persistence(belief.chain[:, 0])
+            own["outlier_share"] = model.share[:, 1:].expand(shape)
+            own["outlier_bias"] = mean[:, 1:].expand(shape)
+            own["outlier_persistence"] = rho.unsqueeze(-1).expand(shape)
+        if self.ins is not None:
+            own["ins_bias"] = belief.bias.norm(dim=-1)
+        return own
 
     def weigh(
         self, y: Float64[Tensor, "B N d"], now: Prepared
@@ -178,10 +263,21 @@ class SwarmFilter(Localizer[SwarmBelief]):
         mask, std = now.links.mask, self.std
         if self.confidence == "none":
             return weights.plain(residual, mask, std)
-        added = now.variance.unsqueeze(-1) + now.variance.unsqueeze(-2)
-        if self.confidence == "huber":
-            return weights.huber(residual, mask, added, std)
-        return weights.calibrated(residual, mask, added, std, now.model)
+        if self.confidence == "em":
+            return weights.calibrated(residual, mask, now.between, std, now.model, now.outlier)
+        weight, shift = weights.huber(residual, mask, now.between, std)
+        if now.silent is not None:
+            weight = weight * weights.papers(residual, now.silent, now.between, std)
+        return weight, shift
+
+    def told(self, weight: Float64[Tensor, "B N N"], now: Prepared) -> Float64[Tensor, "B N N"]:
+        """The information (1/m²) that each link of some weight has: less than the weight in
+        calibrated ones, which cannot be sure whether it is obstructed."""
+        if self.confidence != "em" or now.outlier is None:
+            return weight
+        each = calibration.information(now.model, now.outlier.flatten(1), self.std)
+        each = each.view_as(weight) * now.links.mask
+        return each if now.confidence is None else now.confidence * each
 
     def _fixes(
         self, observation: Observation, position: Float64[Tensor, "B N d"]
@@ -194,24 +290,60 @@ class SwarmFilter(Localizer[SwarmBelief]):
         known = observation["position_fix"].double()
         return fixed, torch.where(fixed.unsqueeze(-1), known, position), sensor.std**2
 
-    def _model(self, belief: SwarmBelief) -> calibration.ErrorModel:
-        return calibration.ErrorModel(sums=belief.errors[:, 0], batch_size=belief.errors.shape[:1])
+    def _learned(self, belief: SwarmBelief, now: Prepared) -> Prepared:
+        """The same with the error model after this step's links between those who know where they
+        are, how these change, and how likely each link is obstructed. Where such links are few, all
+        others count besides, with what is unsure of their ends."""
+        links, std = now.links, self.std
+        guides = now.fixed.any(0).nonzero()[:, 0]
+        known = links.mask & now.fixed.unsqueeze(-1) & now.fixed.unsqueeze(-2)
+        remembered = 0.5 * calibration.FORGET * known.sum((-2, -1))
+        others = (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
+        if bool((others > 0).any()):
+            guides = torch.arange(links.mask.shape[-1], device=guides.device)
+        rows, columns = guides.unsqueeze(-1), guides
 
-    def _learned(
-        self,
-        belief: SwarmBelief,
-        links: Links,
-        place: Float64[Tensor, "B N d"],
-        fixed: Bool[Tensor, "B N"],
-    ) -> calibration.ErrorModel:
-        """The error model after this step's links between those who know where they are."""
-        model = self._model(belief)
-        known = links.mask & fixed.unsqueeze(-1) & fixed.unsqueeze(-2)
-        if self.confidence != "em" or not bool(known.any()):
-            return model
-        error = links.distance - lengths(place)
-        once = torch.triu(known, 1)
-        return calibration.learned(model, error.flatten(1), once.flatten(1), self.std)
+        def part(x: Tensor) -> Tensor:
+            return torch.triu(x[:, rows, columns], 1).flatten(1)
+
+        counts = part(torch.where(known, 1.0, others) * links.mask)
+        error, unsure = part(links.distance - lengths(now.place)), part(now.between)
+        model = calibration.learned(now.model, error, counts, unsure, std)
+        share = model.share[:, 1]
+        chain = persistence.learned(
+            now.chain,
+            part(belief.memory),
+            calibration.outlier_evidence(model, error, unsure, std),
+            counts,
+            share,
+        )
+        rho = persistence.persistence(chain)
+        outlier = persistence.forecast(belief.memory.flatten(1), rho, share)
+        return replace(now, model=model, chain=chain, outlier=outlier.view_as(belief.memory))
+
+    def _remembered(
+        self, belief: SwarmBelief, now: Prepared, found: Found
+    ) -> Float64[Tensor, "B N L"]:
+        """What goes on of each link."""
+        if now.outlier is None:
+            return belief.memory if now.silent is None else now.silent
+        residual = now.links.distance - lengths(found.position.detach())
+        unsure = now.between if found.joint is None else joint.between(found.joint)
+        seen = calibration.outlier_probability(
+            now.model, residual.flatten(1), unsure.flatten(1), self.std, now.outlier.flatten(1)
+        )
+        return torch.where(now.links.mask, seen.view_as(residual), now.outlier)
+
+
+def _for_each(x: Float64[Tensor, "B *s"], shape: torch.Size) -> Float64[Tensor, "B N *s"]:
+    """A world's figures as every UAV has them."""
+    return x.unsqueeze(1).expand(*shape, *x.shape[1:]).contiguous()
+
+
+def _localizable(now: Prepared, dim: int) -> Bool[Tensor, "B N"]:
+    """Who is connected, over any number of links, to at least ``dim`` + 1 UAVs with fixes."""
+    fixes = connected(now.links.mask).double() @ now.fixed.double().unsqueeze(-1)
+    return fixes[..., 0] > dim
 
 
 def begun(now: Prepared) -> Prepared:
@@ -231,6 +363,7 @@ def begun(now: Prepared) -> Prepared:
         now,
         place=torch.where(known.unsqueeze(-1), place, middle),
         variance=torch.where(known, now.variance, UNKNOWN),
+        between=torch.where(known.unsqueeze(-1) & known.unsqueeze(-2), now.between, UNKNOWN),
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.swarm.links import lengths
@@ -15,14 +15,27 @@ _NOTHING = 1e-10  # m⁻²: information on a UAV that nothing ties to an anchor
 
 
 def fisher(
-    y: Float64[Tensor, "B N d"], weight: Float64[Tensor, "B N N"]
-) -> Float64[Tensor, "B N d N d"]:
+    y: Float64[Tensor, "B N d"],
+    weight: Float64[Tensor, "B N N"],
+    index: Int64[Tensor, "M"] | None = None,
+) -> Float64[Tensor, "B M d M d"]:
     """Σ_{i<j} W_ij J_ijᵀ J_ij of distances, J the unit vectors along links: a Laplacian of d × d
-    blocks."""
-    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / lengths(y).unsqueeze(-1)
-    block = (weight.unsqueeze(-1) * unit).unsqueeze(-1) * unit.unsqueeze(-2)
-    matrix = -block.movedim(-2, 2)  # [B, i, x, j, y]
-    matrix.diagonal(dim1=1, dim2=3).add_(block.sum(2).movedim(1, -1))
+    blocks; the rows and columns of the UAVs in ``index`` (None: of all)."""
+    if index is None:
+        index = torch.arange(y.shape[1], device=y.device)
+    b, m, d = y.shape[0], len(index), y.shape[-1]
+    unit = [(c[:, index].unsqueeze(2) - c.unsqueeze(1)) for c in y.unbind(-1)]
+    scale = (weight / lengths(y).square())[:, index]
+    matrix = y.new_empty(b, m, d, m, d)
+    for p in range(d):
+        along = scale * unit[p]
+        for q in range(p, d):
+            block = along * unit[q]
+            part = -block[..., index]
+            part.diagonal(dim1=-2, dim2=-1).add_(block.sum(-1))
+            matrix[:, :, p, :, q] = part
+            if q != p:
+                matrix[:, :, q, :, p] = part
     return matrix
 
 

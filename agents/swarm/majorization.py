@@ -27,6 +27,16 @@ def stress(
     return links + (trust * (y - prior).square().sum(-1)).sum(-1)
 
 
+def pull(
+    y: Float64[Tensor, "B N d"],
+    distance: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B N N"],
+) -> Float64[Tensor, "B N d"]:
+    """The links' part of −½ ∂S/∂y."""
+    each = weight * (distance / lengths(y) - 1.0)
+    return each.sum(-1, keepdim=True) * y - each @ y
+
+
 def descent(
     y: Float64[Tensor, "B N d"],
     distance: Float64[Tensor, "B N N"],
@@ -35,8 +45,7 @@ def descent(
     trust: Float64[Tensor, "B N"],
 ) -> Float64[Tensor, "B N d"]:
     """−½ ∂S/∂y."""
-    pull = weight * (distance / lengths(y) - 1.0)
-    return pull.sum(-1, keepdim=True) * y - pull @ y + trust.unsqueeze(-1) * (prior - y)
+    return pull(y, distance, weight) + trust.unsqueeze(-1) * (prior - y)
 
 
 def majorizer(

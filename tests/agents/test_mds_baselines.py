@@ -21,6 +21,7 @@ from agents.swarm.filter import Prepared, SwarmBelief, SwarmFilter, begun
 from agents.swarm.gauss_newton import fisher
 from agents.swarm.links import Links, connected, lengths
 from agents.swarm.majorization import majorizer, nodewise, own_pull, stress
+from agents.swarm.persistence import believed_chain
 from agents.swarm.scaling import classical_scaling
 from agents.swarm.spread import spread, told
 from agents.swarm.weights import loess
@@ -48,10 +49,18 @@ def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> Prepa
     noise = torch.triu(normal(worlds, n, n), 1)
     fixed = torch.zeros(worlds, n, dtype=torch.bool)
     fixed[:, :5] = True
+    place_now = torch.where(fixed.unsqueeze(-1), place, place + 30 * normal(worlds, n, 3))
+    variance = torch.where(fixed, 0.01, 900.0).double()
     return Prepared(
-        place=torch.where(fixed.unsqueeze(-1), place, place + 30 * normal(worlds, n, 3)),
-        variance=torch.where(fixed, 0.01, 900.0).double(),
-        added=torch.zeros(worlds, n, dtype=torch.float64),
+        state=torch.cat((place_now, torch.zeros_like(place)), -1),
+        place=place_now,
+        variance=variance,
+        added=torch.zeros_like(variance),
+        reckoned=variance,
+        joint=variance.new_zeros(worlds, n, 1, 0),
+        between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
+        drift=None,
+        chain=believed_chain(torch.full((worlds,), 0.1, dtype=torch.float64)),
         fixed=fixed,
         links=Links((true + STD * (noise + noise.mT)) * mask, mask),
         model=believed_model(worlds, STD, torch.device("cpu")),
@@ -67,11 +76,15 @@ def method(agent: str) -> SwarmFilter:
 def belief(now: Prepared, step: int = 1) -> SwarmBelief:
     """All that the three look at: the count of steps."""
     shape = now.fixed.shape
-    empty = now.place.new_zeros(*shape, 3, 0)
     return SwarmBelief(
         state=torch.cat((now.place, now.place), -1),
         variance=now.variance,
-        joint=empty,
+        joint=now.joint,
+        bias=torch.zeros_like(now.place),
+        drift=torch.zeros_like(now.place[..., :2]),
+        chain=now.chain.unsqueeze(1).expand(-1, shape[1], -1, -1),
+        memory=now.variance.new_zeros(*shape, 0),
+        localizable=now.fixed,
         step=torch.full(shape, step),
         errors=now.model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
         batch_size=shape,
@@ -276,6 +289,8 @@ def permuted(now: Prepared, order: Tensor) -> Prepared:
         now,
         place=now.place[:, order],
         variance=now.variance[:, order],
+        reckoned=now.reckoned[:, order],
+        between=now.between[:, order][:, :, order],
         fixed=now.fixed[:, order],
         links=Links(
             now.links.distance[:, order][:, :, order], now.links.mask[:, order][:, :, order]
@@ -312,11 +327,18 @@ def test_a_prior_that_is_no_number_is_made_up_for_by_ranges(agent: str) -> None:
     localizer, lost = method(agent), replace(now, place=place)
     for _ in range(40):
         found = localizer.find(belief(lost, 0), lost)
-        lost = replace(lost, place=found.position, variance=found.variance)
+        between = found.variance.unsqueeze(-1) + found.variance.unsqueeze(-2)
+        lost = replace(lost, place=found.position, variance=found.variance, between=between)
     usual = localizer.find(belief(now, 0), now)
     for _ in range(39):
         usual = localizer.find(
-            belief(now, 0), replace(now, place=usual.position, variance=usual.variance)
+            belief(now, 0),
+            replace(
+                now,
+                place=usual.position,
+                variance=usual.variance,
+                between=usual.variance.unsqueeze(-1) + usual.variance.unsqueeze(-2),
+            ),
         )
     assert found.position.isfinite().all()
     assert found.variance.isfinite().all()

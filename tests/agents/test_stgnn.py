@@ -17,6 +17,7 @@ from agents.stgnn.network import DILATIONS, StGnn
 from agents.swarm.calibration import believed_model
 from agents.swarm.filter import Found, Prepared
 from agents.swarm.links import Links, lengths
+from agents.swarm.persistence import believed_chain
 
 STD, N = 10.0, 14
 
@@ -44,10 +45,16 @@ def moment(seed: int, reach: float = 900.0) -> tuple[Prepared, Found, Tensor, Te
     fixed = torch.zeros(2, N, dtype=torch.bool)
     fixed[:, :4] = True
     moving = ~fixed.unsqueeze(-1)
+    variance = torch.where(fixed, 0.01, 60.0).double()
     now = Prepared(
         state=torch.cat((place, 20 * normal(2, N, 3)), -1),
         place=place + moving * 8 * normal(2, N, 3),
-        variance=torch.where(fixed, 0.01, 60.0).double(),
+        variance=variance,
+        reckoned=variance,
+        joint=variance.new_zeros(2, N, 1, 0),
+        between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
+        drift=None,
+        chain=believed_chain(torch.full((2,), 0.1, dtype=torch.float64)),
         added=torch.full((2, N), 0.3, dtype=torch.float64),
         fixed=fixed,
         links=Links((true + noise + noise.mT) * mask, mask),

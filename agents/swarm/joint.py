@@ -1,0 +1,160 @@
+"""The joint covariance of a team's positions: of all components, or of one that stands for all.
+
+A UAV's rows are [e, N e], e = d for all components and e = 1 for one covariance that every axis
+has; then a range of weight W informs each axis by W/d, as links that point everywhere do on average
+(a graph's Laplacian). Who is fixed has nothing in common with anybody.
+"""
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from agents.swarm.gauss_newton import fisher
+
+_NOTHING = 1e-10  # m⁻²: information on a UAV that nothing is known of
+
+
+def independent(variance: Float64[Tensor, "B N"], e: int) -> Float64[Tensor, "B N e K"]:
+    """That of UAVs with nothing in common, from their variances (m²)."""
+    return torch.diag_embed(variance.repeat_interleave(e, -1)).unflatten(1, (-1, e))
+
+
+def carried(
+    joint: Float64[Tensor, "B N e K"],
+    kept: Float64[Tensor, "B N"],
+    added: Float64[Tensor, "B N"],
+    fixed: Bool[Tensor, "B N"],
+    spread: float,
+) -> Float64[Tensor, "B N e K"]:
+    """k_i k_j P_ij with ``added`` (m²) on the diagonal; ``spread`` (m²) there of who is fixed."""
+    e = joint.shape[2]
+    kept = kept.masked_fill(fixed, 0.0)
+    factor = kept.repeat_interleave(e, -1)
+    after = (factor.unsqueeze(-1) * factor.unsqueeze(-2)) * joint.flatten(1, 2)
+    new = added.masked_fill(fixed, spread).repeat_interleave(e, -1)
+    after.diagonal(dim1=-2, dim2=-1).add_(new)
+    return after.view_as(joint)
+
+
+def between(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N N"]:
+    """Variance (m² per axis) of every vector from UAV to UAV."""
+    e = joint.shape[2]
+    common = joint.unflatten(-1, (-1, e)).diagonal(dim1=2, dim2=4).mean(-1)
+    own = common.diagonal(dim1=-2, dim2=-1)
+    return (own.unsqueeze(-1) + own.unsqueeze(-2) - 2 * common).clamp_min(0.0)
+
+
+def moving(fixed: Bool[Tensor, "B N"]) -> Int64[Tensor, "M"]:
+    """Who is not fixed in some world at least: the others need no rows where systems are solved."""
+    return (~fixed).any(0).nonzero()[:, 0]
+
+
+def among(
+    joint: Float64[Tensor, "B N e K"], index: Int64[Tensor, "M"]
+) -> Float64[Tensor, "B M e L"]:
+    """The joint covariance of some."""
+    e = joint.shape[2]
+    return joint[:, index].unflatten(-1, (-1, e))[..., index, :].flatten(-2)
+
+
+def whole(
+    part: Float64[Tensor, "B M e L"], index: Int64[Tensor, "M"], variance: Float64[Tensor, "B N"]
+) -> Float64[Tensor, "B N e K"]:
+    """That of all, from that of some and the ``variance`` (m² per axis) of the others."""
+    if len(index) == variance.shape[-1]:
+        return part
+    e = part.shape[2]
+    joint = independent(variance, e)
+    rows = (e * index.unsqueeze(-1) + torch.arange(e, device=index.device)).flatten()
+    flat = joint.flatten(1, 2)
+    flat[:, rows.unsqueeze(-1), rows] = part.flatten(1, 2)
+    return joint
+
+
+def scaled(
+    joint: Float64[Tensor, "B N e K"], variance: Float64[Tensor, "B N"]
+) -> Float64[Tensor, "B N e K"]:
+    """The same correlations with other variances (m² per axis)."""
+    e = joint.shape[2]
+    own = joint.flatten(1, 2).diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, e)).mean(-1)
+    factor = (variance / own).sqrt().repeat_interleave(e, -1)
+    whole = factor.unsqueeze(-1) * factor.unsqueeze(-2) * joint.flatten(1, 2)
+    return whole.view_as(joint)
+
+
+def precision(
+    joint: Float64[Tensor, "B N e K"], fixed: Bool[Tensor, "B N"]
+) -> Float64[Tensor, "B K K"]:
+    """The information (1/m²) that it holds on those who are not fixed; 0 for the others."""
+    still, tied = _fixed(fixed, joint.shape[2])
+    whole = joint.flatten(1, 2).masked_fill(tied, 0.0)
+    whole.diagonal(dim1=-2, dim2=-1).masked_fill_(still, 1.0)
+    return _inverse(whole).masked_fill(tied, 0.0)
+
+
+def of_links(
+    y: Float64[Tensor, "B N d"], weight: Float64[Tensor, "B N N"], e: int, index: Int64[Tensor, "M"]
+) -> Float64[Tensor, "B L L"]:
+    """What ranges of some weights (1/m²) tell at some positions of the UAVs in ``index``."""
+    if e > 1:
+        return fisher(y, weight, index).flatten(3).flatten(1, 2)
+    return laplacian(weight / y.shape[-1], index)
+
+
+def laplacian(
+    weight: Float64[Tensor, "B N N"], index: Int64[Tensor, "M"]
+) -> Float64[Tensor, "B M M"]:
+    """The rows and columns in ``index`` of Σ_{i<j} W_ij (e_i − e_j)(e_i − e_j)ᵀ."""
+    rows = weight[:, index]
+    matrix = -rows[..., index]
+    matrix.diagonal(dim1=-2, dim2=-1).add_(rows.sum(-1))
+    return matrix
+
+
+def posterior(
+    information: Float64[Tensor, "B K K"],
+    fixed: Bool[Tensor, "B N"],
+    variance: Float64[Tensor, "B N"],
+) -> Float64[Tensor, "B N e K"]:
+    """The joint covariance from all information (1/m²), and the ``variance`` of who is fixed."""
+    e = information.shape[-1] // fixed.shape[-1]
+    still, tied = _fixed(fixed, e)
+    whole = _inverse(held(information, fixed)).masked_fill(tied, 0.0)
+    known = torch.where(still, variance.repeat_interleave(e, -1), 0.0)
+    whole.diagonal(dim1=-2, dim2=-1).add_(known)
+    return whole.unflatten(1, (-1, e))
+
+
+def drawn(
+    matrix: Float64[Tensor, "B K K"], x: Float64[Tensor, "B N d"]
+) -> Float64[Tensor, "B N d"]:
+    """A matrix of all components, or of one that stands for all axes, times positions."""
+    if matrix.shape[-1] == x.shape[1]:
+        return matrix @ x
+    return (matrix @ x.flatten(1).unsqueeze(-1))[..., 0].view_as(x)
+
+
+def solved(
+    factor: Float64[Tensor, "B K K"], x: Float64[Tensor, "B N d"]
+) -> Float64[Tensor, "B N d"]:
+    """The same for its inverse, from its Cholesky factor."""
+    if factor.shape[-1] == x.shape[1]:
+        return torch.cholesky_solve(x, factor)
+    return torch.cholesky_solve(x.flatten(1).unsqueeze(-1), factor)[..., 0].view_as(x)
+
+
+def held(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B N"]) -> Float64[Tensor, "B K K"]:
+    """A matrix of information in which who is fixed is tied to nobody and has 1 m⁻²."""
+    still, tied = _fixed(fixed, matrix.shape[-1] // fixed.shape[-1])
+    matrix = matrix.masked_fill(tied, 0.0)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
+    return matrix
+
+
+def _fixed(fixed: Bool[Tensor, "B N"], e: int) -> tuple[Bool[Tensor, "B K"], Bool[Tensor, "B K K"]]:
+    still = fixed.repeat_interleave(e, -1)
+    return still, still.unsqueeze(-1) | still.unsqueeze(-2)
+
+
+def _inverse(matrix: Float64[Tensor, "B K K"]) -> Float64[Tensor, "B K K"]:
+    return torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
