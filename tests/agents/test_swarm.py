@@ -1,21 +1,27 @@
 """Scaling, majorization, calibration and Gauss–Newton on whole teams, against others' results."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
+from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import quad
 from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import least_squares, minimize
 from scipy.sparse.csgraph import floyd_warshall
+from scipy.stats import norm
 from torch import Tensor
 
-from agents.swarm import calibration, weights
+from agents.swarm import calibration, drift, joint, persistence, weights
 from agents.swarm.gauss_newton import fisher, gauss_newton
 from agents.swarm.links import lengths, links_of
 from agents.swarm.majorization import descent, guttman, majorizer, stress
 from agents.swarm.scaling import aligned, classical_scaling, shortest_paths
 from coloc_env.observation import Observation
+from coloc_env.sensors import Ins
 
 STD = 10.0
 
@@ -183,7 +189,7 @@ def test_calibration_finds_the_mixture(share: float, bias: float, spread: float)
         outlier = torch.rand(1, 400, generator=generator) < share
         normal = torch.randn(1, 400, generator=generator, dtype=torch.float64)
         error = torch.where(outlier, bias + spread * normal, STD * normal)
-        model = calibration.learned(model, error, torch.ones_like(outlier), STD)
+        model = calibration.learned(model, error, torch.ones_like(error), 0 * error, STD)
     mean, variance = model.component(STD)
     assert float(model.share[0, 1]) == pytest.approx(share, abs=0.04)
     assert float(mean[0, 1]) == pytest.approx(bias, abs=3.0)
@@ -193,8 +199,168 @@ def test_calibration_finds_the_mixture(share: float, bias: float, spread: float)
 def test_nothing_is_learned_from_links_that_were_not_measured() -> None:
     model = calibration.believed_model(1, STD, torch.device("cpu"))
     wild = torch.full((1, 50), 500.0, dtype=torch.float64)
-    after = calibration.learned(model, wild, torch.zeros(1, 50, dtype=torch.bool), STD)
+    after = calibration.learned(model, wild, torch.zeros_like(wild), torch.zeros_like(wild), STD)
     assert torch.allclose(after.share, model.share)
+
+
+def test_calibration_takes_off_what_is_unsure_of_the_ends() -> None:
+    generator = torch.Generator().manual_seed(1)
+    unsure = 100.0
+    model = calibration.believed_model(1, STD, torch.device("cpu"))
+    for _ in range(60):
+        outlier = torch.rand(1, 2000, generator=generator) < 0.3
+        own = torch.randn(2, 1, 2000, generator=generator, dtype=torch.float64)
+        error = torch.where(outlier, 60.0, 0.0) + STD * own[0] + unsure**0.5 * own[1]
+        added = torch.full_like(error, unsure)
+        model = calibration.learned(model, error, torch.ones_like(error), added, STD)
+    mean, variance = model.component(STD)
+    assert float(model.share[0, 1]) == pytest.approx(0.3, abs=0.05)
+    assert float(mean[0, 1]) == pytest.approx(60.0, abs=4.0)
+    assert float(variance[0, 0]) == pytest.approx(STD**2, rel=0.5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15, 0.5, 0.83])
+def test_information_is_scipys_integral(share: float) -> None:
+    mean, variance = 30.0, 15.0**2
+    count = torch.tensor((50.0, 50.0), dtype=torch.float64)
+    first, second = (
+        count * torch.tensor((0.0, mean)),
+        count * torch.tensor((STD**2, variance + mean**2)),
+    )
+    model = calibration.ErrorModel(
+        sums=torch.stack((count, first.double(), second.double()), -1)[None], batch_size=(1,)
+    )
+
+    def density(e: float) -> float:
+        return (1 - share) * norm.pdf(e, 0, STD) + share * norm.pdf(e, mean, variance**0.5)
+
+    def slope(e: float) -> float:
+        other = share * norm.pdf(e, mean, variance**0.5) * (mean - e) / variance
+        return (1 - share) * norm.pdf(e, 0, STD) * -e / STD**2 + other
+
+    expected, _ = quad(lambda e: slope(e) ** 2 / density(e), -60, 120, limit=200)
+    prior = torch.tensor([[share]], dtype=torch.float64)
+    found = calibration.information(model, prior, STD)
+    assert float(found) == pytest.approx(expected, rel=0.01)
+
+
+# ---------------------------------------------------------------- links that stay obstructed
+
+
+def chain_of_states(rho: float, share: float, steps: int, links: int) -> Tensor:
+    """States [steps, links] of a chain that is drawn anew with probability 1 − ρ."""
+    generator = torch.Generator().manual_seed(3)
+    state = torch.rand(links, generator=generator) < share
+    states = [state]
+    for _ in range(steps - 1):
+        kept, drawn = torch.rand(2, links, generator=generator)
+        state = torch.where(kept < rho, state, drawn < share)
+        states.append(state)
+    return torch.stack(states)
+
+
+def test_links_states_are_those_of_the_brute_force_forward_algorithm() -> None:
+    rho, share, steps = 0.8, 0.3, 8
+    evidence = 2 * torch.randn(steps, generator=torch.Generator().manual_seed(0)).double()
+    found = torch.tensor([[share]], dtype=torch.float64)
+    one = torch.tensor([rho], dtype=torch.float64)
+    for each in evidence:
+        found = persistence.forecast(found, one, one.new_tensor([share]))
+        found = torch.sigmoid(torch.logit(found) + each)
+    weights_of_paths, obstructed = 0.0, 0.0
+    for path in itertools.product((0, 1), repeat=steps):
+        p = share if path[0] else 1 - share
+        for before, now in itertools.pairwise(path):
+            p *= rho * (before == now) + (1 - rho) * (share if now else 1 - share)
+        p *= float(np.exp((np.array(path) * evidence.numpy()).sum()))
+        weights_of_paths += p
+        obstructed += p * path[-1]
+    assert float(found) == pytest.approx(obstructed / weights_of_paths, abs=1e-9)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
+def test_persistence_is_learned(rho: float) -> None:
+    share, links = 0.4, 400
+    states = chain_of_states(rho, share, 60, links)
+    noise = STD * torch.randn(states.shape, generator=torch.Generator().manual_seed(4))
+    error = torch.where(states, 25.0, 0.0) + noise
+    evidence = ((error.square() - (error - 25.0).square()) / (2 * STD**2)).double()
+    shares = torch.tensor([share], dtype=torch.float64)
+    counts = persistence.believed_chain(shares)
+    before = torch.full((1, links), share, dtype=torch.float64)
+    ones = torch.ones_like(before)
+    for each in evidence:
+        counts = persistence.learned(counts, before, each[None], ones, shares)
+        prior = persistence.forecast(before, persistence.persistence(counts), shares)
+        before = torch.sigmoid(torch.logit(prior) + each)
+    assert float(persistence.persistence(counts)) == pytest.approx(rho, abs=0.06)
+
+
+# ---------------------------------------------------------------- INS bias
+
+
+def test_the_bias_is_filterpys() -> None:
+    ins, dt, other = Ins(std=0.5, bias=0.8, bias_time=30.0), 2.0, 9.0
+    kept = float(np.exp(-dt / ins.bias_time))
+    reference = KalmanFilter(dim_x=2, dim_z=1)  # position and bias
+    reference.P = np.diag((100.0, ins.bias**2))
+    reference.F = np.array(((1.0, -dt * kept), (0.0, kept)))
+    grown = ins.bias**2 * (1 - kept**2)
+    reference.Q = grown * np.outer((-dt, 1.0), (-dt, 1.0)) + np.diag((dt**2 * ins.std**2, 0.0))
+    reference.H, reference.R = np.array(((1.0, 0.0),)), np.array(((other,),))
+    reference.B = np.array(((dt,), (0.0,)))
+    zero = torch.zeros(1, 1, dtype=torch.float64)
+    state = drift.Drift(zero.unsqueeze(-1), zero, zero + ins.bias**2)
+    place, variance = zero.unsqueeze(-1), zero + 100.0
+    time = torch.full_like(zero, dt)
+    for speed, seen in zip((1.0, -2.0, 0.5, 3.0), (4.0, 1.0, 2.5, 9.0), strict=True):
+        reference.predict(u=np.array(((speed,),)))
+        reference.update(np.array(((seen,),)))
+        state = drift.aged(state, time, ins)
+        before = place + (speed - state.bias) * dt
+        state, factor, new = drift.reckoned(state, variance, time, ins)
+        was = factor.square() * variance + new
+        variance = 1 / (1 / was + 1 / other)
+        place = before + (variance / other).unsqueeze(-1) * (seen - before)
+        state = drift.informed(state, place - before, was, variance)
+    found = (float(place), float(state.bias))
+    np.testing.assert_allclose(found, reference.x.ravel(), rtol=1e-9)
+    moments = ((float(variance), float(state.cross)), (float(state.cross), float(state.variance)))
+    np.testing.assert_allclose(moments, reference.P, rtol=1e-9)
+
+
+# ---------------------------------------------------------------- the joint covariance
+
+
+@pytest.mark.parametrize("e", [1, 3])
+def test_joint_covariance_is_numpys(e: int) -> None:
+    world = team(9)
+    y, fixed, variance = world["place"], world["fixed"], torch.full((2, 12), 9.0).double()
+    variance[fixed] = 0.25
+    k = 12 * e
+    root = torch.randn(2, k, k, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    before = (root @ root.mT + k * torch.eye(k)).unflatten(1, (12, e))
+    kept, added = torch.linspace(0.8, 1.0, 24).double().view(2, 12), 4 * torch.ones(2, 12).double()
+    now = joint.carried(before, kept, added, fixed, 0.25)
+    index = joint.moving(fixed)
+    trust = joint.precision(joint.among(now, index), fixed[:, index])
+    told = joint.of_links(y, world["weight"], e, index)
+    found = joint.whole(
+        joint.posterior(told + trust, fixed[:, index], variance[:, index]), index, variance
+    )
+    each = kept.repeat_interleave(e, -1)[0].numpy()
+    whole = each[:, None] * before.flatten(1, 2)[0].numpy() * each + 4 * np.eye(k)
+    free = slice(4 * e, None)
+    every = torch.arange(12)
+    links = joint.of_links(y, world["weight"], e, every)[0].numpy()[free, free]
+    expected = np.linalg.inv(np.linalg.inv(whole[free, free]) + links)
+    result = found.flatten(1, 2)[0].numpy()
+    np.testing.assert_allclose(result[free, free], expected, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(result[: 4 * e, : 4 * e], 0.25 * np.eye(4 * e))
+    apart = joint.between(found)[0, 5, 9]
+    blocks = result.reshape(12, e, 12, e)
+    difference = blocks[5, :, 5] + blocks[9, :, 9] - blocks[5, :, 9] - blocks[9, :, 5]
+    assert float(apart) == pytest.approx(np.trace(difference) / e)
 
 
 def test_a_link_with_an_outliers_residual_is_shifted_back_and_counts_less() -> None:
@@ -260,3 +426,6 @@ def test_fisher_information_is_that_of_automatic_differentiation() -> None:
     jacobian = torch.func.jacrev(measured)(world["place"].flatten())
     found = fisher(world["place"], world["weight"])[0].flatten(2).flatten(0, 1)
     assert torch.allclose(found, jacobian.mT @ jacobian, atol=1e-12)
+    some = fisher(world["place"], world["weight"], torch.tensor([1, 4]))[0].flatten(2).flatten(0, 1)
+    kept = torch.tensor([3, 4, 5, 12, 13, 14])
+    assert torch.allclose(some, found[kept][:, kept], atol=1e-12)
