@@ -11,11 +11,11 @@ from torch import Tensor
 from agents.checkpoint import learned
 from agents.dwmds import DynamicMds
 from agents.localizer import Estimate, Localizer, register
-from agents.stgnn.features import Memory, Scene, along_links, forgotten, look
+from agents.stgnn.features import Memory, Scene, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
 from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
-from agents.swarm.links import lengths
+from agents.swarm.links import along_links, lengths
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed

@@ -12,7 +12,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.swarm.filter import Found, Prepared
-from agents.swarm.links import lengths
+from agents.swarm.links import along_links, lengths, own_information
 
 SCALARS = (
     *("log_degree", "fixed_neighbours", "fixed", "confidence"),
@@ -79,30 +79,6 @@ def forgotten(worlds: int, n: int, dim: int, device: torch.device) -> Memory:
     )
 
 
-def along_links(
-    y: Float64[Tensor, "B N d"], strength: Float64[Tensor, "B *K N N"], length: Tensor
-) -> Float64[Tensor, "B *K N d"]:
-    """Σ_j s_ij u_ij, u_ij the unit vector from j to i."""
-    s = strength / length
-    return s.sum(-1, keepdim=True) * y - s @ y
-
-
-def information(
-    y: Float64[Tensor, "B N d"],
-    weight: Float64[Tensor, "B N N"],
-    length: Float64[Tensor, "B N N"],
-) -> Float64[Tensor, "B N d d"]:
-    """Σ_j W_ij u_ij u_ijᵀ (1/m²): what links say of a UAV whose neighbours stand still."""
-    s = weight / length.square()
-    d = y.shape[-1]
-    outer = (y.unsqueeze(-1) * y.unsqueeze(-2)).flatten(-2)
-    moments = s @ torch.cat((y, outer), -1)
-    first, second = moments[..., :d], moments[..., d:].unflatten(-1, (d, d))
-    own = outer.unflatten(-1, (d, d)) * s.sum(-1)[..., None, None]
-    cross = y.unsqueeze(-1) * first.unsqueeze(-2)
-    return own + second - cross - cross.mT
-
-
 def look(
     now: Prepared,
     found: Found,
@@ -114,96 +90,104 @@ def look(
     """The scene of a step whose optimizer has ``found`` positions with those weights (1/m²) and
     shifts (m), and the memory after it."""
     mask, d = now.links.mask, found.position.shape[-1]
-    there = mask.double()
     y = found.position - found.position.mean(1, keepdim=True)
     length = lengths(y)
-    residual = (now.links.distance - length) * there
+    residual = (now.links.distance - length) * mask
     innovation = torch.where(now.fixed.unsqueeze(-1), 0.0, now.place - found.position)
     memory = _remembered(memory, residual, mask, innovation)
-    # A neighbour that is lost says little: its own variance is in the way.
-    vague = (now.variance / (1 + 0.5 * weight.sum(-1) / d * now.variance)).unsqueeze(-2)
-    eff = weight / (1 + weight * vague)
-    plain = there / (std**2 + vague)
-    trust = 1 / now.variance
+    vague = _vagueness(now, weight, d).unsqueeze(-2)
+    certain, trust = weight / (1 + weight * vague), 1 / now.variance
     eye = torch.eye(d, dtype=y.dtype, device=y.device)
-    told = information(y, eff, length)
-    h = told + trust[..., None, None] * eye
-    root = torch.linalg.cholesky_ex(h).L
+    told = own_information(y, certain, length) + trust[..., None, None] * eye
+    root = torch.linalg.cholesky_ex(told).L
     gain = torch.cholesky_inverse(root)
-    e = (residual / std).clamp(-_CLIP, _CLIP)
-    lasting = (memory.residual / std).clamp(-_CLIP, _CLIP) * there
-    tukey = e * (1 - (e / _TUKEY).square()).clamp_min(0.0).square()
-    strengths = torch.stack(
-        (
-            eff * (residual - shift),
-            plain * std * e.clamp(-_SOFT, _SOFT),
-            plain * std * tukey,
-            plain * std * e.clamp_min(0.0),
-            plain * std * lasting,
-        ),
-        1,
+    error = (residual / std).clamp(-_CLIP, _CLIP)
+    lasting = (memory.residual / std).clamp(-_CLIP, _CLIP) * mask
+    alike = std * mask / (std**2 + vague)
+    strengths = (
+        certain * (residual - shift),
+        alike * error.clamp(-_SOFT, _SOFT),
+        alike * error * (1 - (error / _TUKEY).square()).clamp_min(0.0).square(),
+        alike * error.clamp_min(0.0),
+        alike * lasting,
     )
-    pulls = along_links(y.unsqueeze(1), strengths, length.unsqueeze(1)).movedim(1, -1)
-    newton, others = pulls[..., :1], pulls[..., 1:]
-    vectors = torch.cat(
+    pulls = along_links(y.unsqueeze(1), torch.stack(strengths, 1), length.unsqueeze(1))
+    newton, *others = pulls.unbind(1)
+    steps = gain @ torch.stack((newton, trust.unsqueeze(-1) * innovation, *others), -1)
+    vectors = torch.cat((steps, innovation.unsqueeze(-1), memory.innovations), -1)
+    vectors = torch.where(now.fixed[..., None, None], 0.0, vectors)
+    confidence = (weight * std**2).clamp_max(1.0)
+    apart = lengths(now.state[..., d : 2 * d]) * mask
+    each = (error, lasting, confidence, torch.log1p(apart / std))
+    scalars = _scalars(now, found, std, memory, told, root, each)
+    error, lasting, confidence, speed = each
+    link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence,
+            speed / 4)  # fmt: skip
+    moves = ~now.fixed
+    return Scene(
+        scalars, vectors, torch.stack(link, -1), mask, moves, y, length, certain, gain, trust
+    ), memory
+
+
+def _vagueness(now: Prepared, weight: Float64[Tensor, "B N N"], dim: int) -> Float64[Tensor, "B N"]:
+    """What each UAV is unsure of (m² per axis), by its own links: it is in the way of those that
+    range to it."""
+    return now.variance / (1 + 0.5 * weight.sum(-1) / dim * now.variance)
+
+
+def _scalars(
+    now: Prepared,
+    found: Found,
+    std: float,
+    memory: Memory,
+    told: Float64[Tensor, "B N d d"],
+    root: Float64[Tensor, "B N d d"],
+    links: tuple[Tensor, ...],
+) -> Float64[Tensor, "B N F"]:
+    """SCALARS of every UAV; ``told`` is H, ``root`` its Cholesky factor, ``links`` the error, the
+    lasting error, the confidence and the relative speed of each link."""
+    error, lasting, confidence, speed = links
+    count = now.links.mask.sum(-1).double()
+
+    def mean(of: Tensor) -> Tensor:
+        return of.sum(-1) / count.clamp_min(1.0)
+
+    d = told.shape[-1]
+    volume = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1) / d
+    size = (told.diagonal(dim1=-2, dim2=-1).sum(-1) / d).log()
+    bias, variance = now.model.component(std)
+    everywhere = torch.stack(
         (
-            gain
-            @ torch.cat((newton, trust[..., None, None] * innovation.unsqueeze(-1), others), -1),
-            innovation.unsqueeze(-1),
-            memory.innovations,
+            now.model.share[:, 1],
+            torch.log(variance[:, 0] / std**2),
+            bias[:, 1] / std / 4,
+            torch.log(variance[:, 1] / std**2) / 4,
         ),
         -1,
     )
-    vectors = torch.where(now.fixed[..., None, None], 0.0, vectors)
-    confidence = (weight * std**2).clamp_max(1.0)
-    velocity = now.state[..., d : 2 * d]
-    apart = lengths(velocity) * there
-    speed = torch.log1p(apart / std)
-    count = there.sum(-1)
-    some = count.clamp_min(1.0)
-
-    def mean(of: Tensor) -> Tensor:
-        return of.sum(-1) / some
-
-    spread = torch.log(now.variance / std**2)
-    logdet = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1) / d
-    trace = (h.diagonal(dim1=-2, dim2=-1).sum(-1) / d).log()
-    model_mean, model_variance = now.model.component(std)
-    each = now.variance.new_ones(now.variance.shape)
-    scalars = torch.stack(
+    own = torch.stack(
         (
             torch.log1p(count) / 4,
-            mean(there * now.fixed.unsqueeze(-2)),
+            mean((now.links.mask & now.fixed.unsqueeze(-2)).double()),
             now.fixed.double(),
             mean(confidence),
-            spread / 4,
+            torch.log(now.variance / std**2) / 4,
             torch.log(found.variance / std**2) / 4,
             torch.log(now.added.clamp_min(1e-12) / std**2) / 4,
-            trace - logdet,
-            (trust.log() - logdet) / 4,
-            mean(e),
-            mean(e.square()).sqrt(),
-            mean((e.abs() > 2).double() * there),
-            mean((e > 2).double()),
+            size - volume,
+            -(torch.log(now.variance) + volume) / 4,
+            mean(error),
+            mean(error.square()).sqrt(),
+            mean((error.abs() > _SOFT).double()),
+            mean((error > _SOFT).double()),
             mean(lasting),
             mean(lasting.abs()),
             mean(speed) / 4,
-            each * now.model.share[:, 1:],
-            each * torch.log(model_variance[:, :1] / std**2),
-            each * (model_mean[:, 1:] / std / 4),
-            each * (torch.log(model_variance[:, 1:] / std**2) / 4),
-            1 / (1 + memory.steps),
         ),
         -1,
     )
-    link = torch.stack(
-        (e, e.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence, speed / 4),
-        -1,
-    )
-    return (
-        Scene(scalars, vectors, link, mask, ~now.fixed, y, length, eff, gain, trust),
-        memory,
-    )
+    age = (1 / (1 + memory.steps)).unsqueeze(-1)
+    return torch.cat((own, everywhere.unsqueeze(1).expand(-1, own.shape[1], -1), age), -1)
 
 
 def _remembered(

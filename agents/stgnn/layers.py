@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from agents.layers import Linear, sigmoid
-from agents.stgnn.features import LINKS, Scene, along_links
+from agents.stgnn.features import LINKS, Scene
+from agents.swarm.links import along_links
 
 FAR_APART = 2.0  # times the mean relative speed of a UAV's links
 DOUBTFUL = 0.1  # confidence

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from agents.swarm.links import lengths
+from agents.swarm.links import along_links, lengths
 
 Weigh = Callable[
     [Float64[Tensor, "B N N"]], tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
@@ -59,8 +59,7 @@ def gauss_newton(
         length = lengths(y)
         residual = distance - length
         weight, shift = weigh(residual)
-        pull = weight * (residual - shift) / length
-        down = (pull.sum(-1, keepdim=True) * y - pull @ y).flatten(1)
+        down = along_links(y, weight * (residual - shift), length).flatten(1)
         down = down + (precision @ (prior - y).flatten(1).unsqueeze(-1))[..., 0]
         matrix = fisher(y, weight).flatten(3).flatten(1, 2) + precision
         matrix = matrix.masked_fill(tied, 0.0)

@@ -52,3 +52,27 @@ def connected(mask: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N N"]:
         if torch.equal(further, reach):
             return reach
         reach = further
+
+
+def along_links(
+    y: Float64[Tensor, "B N d"], strength: Float64[Tensor, "B *K N N"], length: Tensor
+) -> Float64[Tensor, "B *K N d"]:
+    """Σ_j s_ij u_ij, u_ij the unit vector from j to i."""
+    s = strength / length
+    return s.sum(-1, keepdim=True) * y - s @ y
+
+
+def own_information(
+    y: Float64[Tensor, "B N d"],
+    weight: Float64[Tensor, "B N N"],
+    length: Float64[Tensor, "B N N"],
+) -> Float64[Tensor, "B N d d"]:
+    """Σ_j W_ij u_ij u_ijᵀ (1/m²): what links say of a UAV whose neighbours stand still."""
+    s = weight / length.square()
+    d = y.shape[-1]
+    outer = (y.unsqueeze(-1) * y.unsqueeze(-2)).flatten(-2)
+    moments = s @ torch.cat((y, outer), -1)
+    first, second = moments[..., :d], moments[..., d:].unflatten(-1, (d, d))
+    own = outer.unflatten(-1, (d, d)) * s.sum(-1)[..., None, None]
+    cross = y.unsqueeze(-1) * first.unsqueeze(-2)
+    return own + second - cross - cross.mT

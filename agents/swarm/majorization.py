@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from agents.swarm.links import lengths
+from agents.swarm.links import along_links, lengths
 
 RELAXED = 1.9  # ω of steps beyond the majorant's minimum; at 2 they could go on for ever
 
@@ -33,8 +33,8 @@ def pull(
     weight: Float64[Tensor, "B N N"],
 ) -> Float64[Tensor, "B N d"]:
     """The links' part of −½ ∂S/∂y."""
-    each = weight * (distance / lengths(y) - 1.0)
-    return each.sum(-1, keepdim=True) * y - each @ y
+    length = lengths(y)
+    return along_links(y, weight * (distance - length), length)
 
 
 def descent(

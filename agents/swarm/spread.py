@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from agents.swarm.links import lengths
+from agents.swarm.links import lengths, own_information
 
 _HOPS = 6  # links that information goes along
 _NOTHING = 1e-9  # m⁻²: information where there is none
@@ -33,17 +33,13 @@ def told(
     count, total = linked.sum(-1), weight.sum(-1)
     seen = count * (weight * (distance - length)).square().sum(-1) / total.square()
     noise = torch.where(total > 0, seen, 0.0).clamp_min(std**2).unsqueeze(-1)
-    near = linked / length.clamp_min(std).square()
+    near = length.clamp_min(std)
     y = y - y.mean(1, keepdim=True)
-    outer = (y.unsqueeze(-1) * y.unsqueeze(-2)).flatten(-2)
     eye = torch.eye(d, dtype=y.dtype, device=y.device)
     information = y.new_zeros(*y.shape, d)
     unsure = torch.where(fixed, variance, torch.inf)
     for _ in range(_HOPS):
-        w = near / (noise + unsure.unsqueeze(-2))
-        cross = y.unsqueeze(-1) * (w @ y).unsqueeze(-2)
-        about = w.sum(-1, keepdim=True) * outer + w @ outer
-        information = about.unflatten(-1, (d, d)) - cross - cross.mT
+        information = own_information(y, linked / (noise + unsure.unsqueeze(-2)), near)
         inverse = torch.linalg.inv_ex(information + _NOTHING * eye).inverse
         own = inverse.diagonal(dim1=-2, dim2=-1).mean(-1)
         unsure = torch.where(fixed, variance, own.masked_fill(own > _LOST, torch.inf))

@@ -11,12 +11,12 @@ from scipy.stats import ortho_group
 from torch import Tensor
 
 from agents.checkpoint import untrained
-from agents.stgnn.features import SCALARS, Memory, forgotten, information, look
+from agents.stgnn.features import SCALARS, Memory, forgotten, look
 from agents.stgnn.layers import DilatedConvolution, TopologicalAttention, carried_over
 from agents.stgnn.network import DILATIONS, StGnn
 from agents.swarm.calibration import believed_model
 from agents.swarm.filter import Found, Prepared
-from agents.swarm.links import Links, lengths
+from agents.swarm.links import Links, lengths, own_information
 from agents.swarm.persistence import believed_chain
 
 STD, N = 10.0, 14
@@ -245,7 +245,9 @@ def test_information_and_carried_displacements_are_what_sums_over_links_give() -
     y = scene.position
     unit = (y.unsqueeze(2) - y.unsqueeze(1)) / scene.length.unsqueeze(-1)
     blocks = torch.einsum("bij,bijx,bijy->bixy", scene.weight, unit, unit)
-    assert torch.allclose(information(y, scene.weight, scene.length), blocks, rtol=1e-7, atol=1e-12)
+    assert torch.allclose(
+        own_information(y, scene.weight, scene.length), blocks, rtol=1e-7, atol=1e-12
+    )
     v = torch.randn(2, N, 3, 4, generator=torch.Generator().manual_seed(3)).double()
     pushed = torch.einsum("bij,bijx,bijy,bjyc->bixc", scene.weight, unit, unit, v)
     assert torch.allclose(carried_over(scene, v), scene.gain @ pushed, rtol=1e-6, atol=1e-9)
