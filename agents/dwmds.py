@@ -19,7 +19,7 @@ from agents.swarm.majorization import pull
 from coloc_env.scenario import Believed
 
 _REFRESH = (0, 2)  # iterations at which weights are made anew
-_SELDOM = 5  # and, in the first step, every so many
+_SELDOM = 10  # and, in the first step, every so many
 _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
 _RELAXED = 1.8  # of a step of the Guttman transform, which overestimates how much ranges hold
 
@@ -34,7 +34,8 @@ class DynamicMds(SwarmFilter):
     have in common: ``full``, or one covariance for all ``axes``, at a fraction of the cost, which
     does where UAVs have twenty neighbours and more. ``bias=false`` does not estimate the INS's.
     ``prior=false`` forgets dead reckoning once it has been started from. ``v_max`` (m/s): no UAV is
-    said to be faster (the paper's projection). ``iterations`` a step, ``first`` in the first.
+    said to be faster (the paper's projection). ``iterations`` a step (5; with full covariance 3,
+    each with weights of its own), ``first`` in the first (60; 15).
     """
 
     name = "dwmds_st"
@@ -48,10 +49,13 @@ class DynamicMds(SwarmFilter):
         bias: bool = True,
         prior: bool = True,
         v_max: float | None = None,
-        iterations: int = 5,
-        first: int = 60,
+        iterations: int | None = None,
+        first: int | None = None,
     ) -> None:
         super().__init__(believed, confidence, bias)
+        usual = (3, 15) if covariance == "full" else (5, 60)
+        iterations = usual[0] if iterations is None else iterations
+        first = max(iterations, usual[1]) if first is None else first
         if not 1 <= iterations <= first:
             raise ValueError(
                 f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
@@ -75,16 +79,14 @@ class DynamicMds(SwarmFilter):
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
         for k in range(self.first if bool(begins.any()) else self.iterations):
             goes_on = begins | (k < self.iterations)  # a world that is not new stops earlier
-            if k in _REFRESH or k % _SELDOM == 0:
+            if self.rows > 1 or k in _REFRESH or k % _SELDOM == 0:
                 if k == _REFRESH[-1] and bool(begins.any()):
                     at = self.nearer(y, weight, trust, now, begins)
                 weight, shift = (
                     torch.where(goes_on, new, old)
                     for new, old in zip(self.weigh(y, at), (weight, shift), strict=True)
                 )
-                if k == 0 or self.rows == 1 or bool(begins.any()):
-                    made = self.majorizer(y, weight, trust, now.fixed, index)
-                    factor = torch.where(begins, made, factor) if k and self.rows > 1 else made
+                factor = self.majorizer(y, weight, trust, now.fixed, index)
             down = torch.where(still, 0.0, pull(y, distance - shift, weight))[:, index]
             down = down + joint.drawn(trust, (now.place - y)[:, index])
             step = self.relaxed * joint.solved(factor, down)
