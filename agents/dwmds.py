@@ -18,6 +18,7 @@ from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmF
 from agents.swarm.majorization import pull
 from coloc_env.scenario import Believed
 
+Covariance = Literal["full", "axes"]
 _REFRESH = (0, 2)  # iterations at which weights are made anew
 _SELDOM = 10  # and, in the first step, every so many
 _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
@@ -45,7 +46,7 @@ class DynamicMds(SwarmFilter):
         believed: Believed,
         *,
         confidence: Confidence = "em",
-        covariance: Literal["full", "axes"] = "full",
+        covariance: Covariance = "full",
         bias: bool = True,
         prior: bool = True,
         v_max: float | None = None,

@@ -9,7 +9,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.checkpoint import learned
-from agents.dwmds import DynamicMds
+from agents.dwmds import Covariance, DynamicMds
 from agents.localizer import Estimate, Localizer, register
 from agents.stgnn.features import Memory, Scene, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
@@ -149,8 +149,8 @@ class StDcl(NetworkLoop):
     """ST-DCL whole: ``dwmds_st``, the ST-GNN, and the loop between them.
 
     ``feedback``: ``learned`` (what the shipped weights were trained with), ``paper`` (equation 36),
-    ``none``, ``links``, ``positions``. ``confidence``: the optimizer's. ``weights``: a checkpoint's
-    name or path, or ``none``.
+    ``none``, ``links``, ``positions``. ``confidence`` and ``covariance``: the optimizer's.
+    ``weights``: a checkpoint's name or path, or ``none``.
     """
 
     name = "stdcl"
@@ -162,8 +162,9 @@ class StDcl(NetworkLoop):
         weights: str = "stdcl",
         feedback: Feedback = "learned",
         confidence: Confidence = "em",
+        covariance: Covariance = "full",
     ) -> None:
-        base = DynamicMds(believed, confidence=confidence, covariance="axes")
+        base = DynamicMds(believed, confidence=confidence, covariance=covariance)
         super().__init__(base, learned(StGnn, weights), feedback)
 
 

@@ -60,6 +60,7 @@ class Scene:
     weight: Float64[Tensor, "B N N"]
     gain: Float64[Tensor, "B N d d"]
     trust: Float64[Tensor, "B N"]
+    spread: Float64[Tensor, "B N"]
 
     def to(self, like: Tensor) -> "Scene":
         """The same in another precision."""
@@ -124,9 +125,8 @@ def look(
     link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence,
             speed / 4)  # fmt: skip
     moves = ~now.fixed
-    return Scene(
-        scalars, vectors, torch.stack(link, -1), mask, moves, y, length, certain, gain, trust
-    ), memory
+    seen = (scalars, vectors, torch.stack(link, -1), mask, moves, y, length, certain, gain, trust)
+    return Scene(*seen, found.variance.sqrt()), memory
 
 
 def _vagueness(now: Prepared, weight: Float64[Tensor, "B N N"], dim: int) -> Float64[Tensor, "B N"]:

@@ -258,7 +258,7 @@ def test_corrections_are_bounded_and_spare_who_is_fixed() -> None:
     network = stirred(11)
     network.out.bias += 1e6
     (correction,) = answered(network, (now, found, weight, shift))
-    most = 3.0 * now.variance.sqrt()
+    most = 3.0 * found.variance.sqrt()
     assert (correction.offset.norm(dim=-1) <= most + 1e-9).all()
     assert (correction.offset[now.fixed] == 0).all()
 
