@@ -5,7 +5,6 @@ UAV. The paper's window of past ranges is folded into a recursive prior with a j
 """
 
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -15,10 +14,9 @@ from agents.ekf import elapsed
 from agents.localizer import register
 from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
-from agents.swarm.majorization import pull
+from agents.swarm.majorization import pull, require_iterations
 from coloc_env.scenario import Believed
 
-Covariance = Literal["full", "axes"]
 _REFRESH = (0, 2)  # iterations at which weights are made anew
 _SELDOM = 10  # and, in the first step, every so many
 _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
@@ -29,14 +27,14 @@ _RELAXED = 1.8  # of a step of the Guttman transform, which overestimates how mu
 class DynamicMds(SwarmFilter):
     """Whole-team stress majorization with a recursive prior from dead reckoning.
 
+    What errors have in common is kept as one covariance for all axes, which does where UAVs have
+    twenty neighbours and more that surround them; ``map`` keeps all of it, at three times the cost.
+
     ``confidence``: how much a link counts: ``em`` by a two-component error model that is fitted to
     the links between UAVs that know where they are, ``huber``, ``paper`` (Huber's, held down by
-    what the paper detects), or ``none`` (all alike). ``covariance``: what is kept of what errors
-    have in common: ``full``, or one covariance for all ``axes``, at a fraction of the cost, which
-    does where UAVs have twenty neighbours and more. ``bias=false`` does not estimate the INS's.
+    what the paper detects), or ``none`` (all alike). ``bias=false`` does not estimate the INS's.
     ``prior=false`` forgets dead reckoning once it has been started from. ``v_max`` (m/s): no UAV is
-    said to be faster (the paper's projection). ``iterations`` a step (5; with full covariance 3,
-    each with weights of its own), ``first`` in the first (60; 15).
+    said to be faster (the paper's projection). ``iterations`` a step, ``first`` in the first.
     """
 
     name = "dwmds_st"
@@ -46,29 +44,20 @@ class DynamicMds(SwarmFilter):
         believed: Believed,
         *,
         confidence: Confidence = "em",
-        covariance: Covariance = "full",
         bias: bool = True,
         prior: bool = True,
         v_max: float | None = None,
-        iterations: int | None = None,
-        first: int | None = None,
+        iterations: int = 5,
+        first: int = 60,
     ) -> None:
         super().__init__(believed, confidence, bias)
-        usual = (3, 15) if covariance == "full" else (5, 60)
-        iterations = usual[0] if iterations is None else iterations
-        first = max(iterations, usual[1]) if first is None else first
-        if not 1 <= iterations <= first:
-            raise ValueError(
-                f"iterations={iterations}, first={first} is not allowed: 1 ≤ iterations ≤ first"
-            )
+        require_iterations(iterations, first)
         if v_max is not None and not v_max > 0:
             raise ValueError(f"v_max={v_max} is not allowed: a speed in m/s > 0")
         self.prior, self.iterations, self.first, self.v_max = prior, iterations, first, v_max
-        self.rows = self.process.dim if covariance == "full" else 1
-        self.relaxed = 1.0 if self.rows > 1 else _RELAXED
 
     def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
-        return joint.independent(variance, self.rows)
+        return joint.independent(variance, 1)
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
         """Algorithm 1's inner loop, and the covariance of what it finds."""
@@ -80,22 +69,23 @@ class DynamicMds(SwarmFilter):
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
         for k in range(self.first if bool(begins.any()) else self.iterations):
             goes_on = begins | (k < self.iterations)  # a world that is not new stops earlier
-            if self.rows > 1 or k in _REFRESH or k % _SELDOM == 0:
+            if k in _REFRESH or k % _SELDOM == 0:
                 if k == _REFRESH[-1] and bool(begins.any()):
-                    at = self.nearer(y, weight, trust, now, begins)
+                    at = self.nearer(weight, trust, now, begins)
                 weight, shift = (
                     torch.where(goes_on, new, old)
                     for new, old in zip(self.weigh(y, at), (weight, shift), strict=True)
                 )
-                factor = self.majorizer(y, weight, trust, now.fixed, index)
+                links = joint.laplacian(weight, index)
+                factor = torch.linalg.cholesky_ex(joint.held(links + trust, now.fixed[:, index])).L
             down = torch.where(still, 0.0, pull(y, distance - shift, weight))[:, index]
-            down = down + joint.drawn(trust, (now.place - y)[:, index])
-            step = self.relaxed * joint.solved(factor, down)
+            down = down + trust @ (now.place - y)[:, index]
+            step = _RELAXED * torch.cholesky_solve(down, factor)
             y = torch.where(goes_on, y.index_add(1, index, step), y)
         if self.v_max is not None:
             y = self.slowed(belief, now, y)
         weight, _ = self.weigh(y, at)
-        together = self.known(y, weight, trust, now, index)
+        together = self.known(weight, trust, now, index)
         variance = own_blocks(together).diagonal(dim1=-2, dim2=-1).mean(-1)
         return Found(y, variance, together)
 
@@ -104,40 +94,22 @@ class DynamicMds(SwarmFilter):
         if self.prior:
             return joint.precision(joint.among(now.joint, index), now.fixed[:, index])
         forgotten = torch.where(now.fixed, 0.0, _FORGOTTEN)[:, index]
-        return joint.independent(forgotten, self.rows).flatten(1, 2)
-
-    def majorizer(
-        self,
-        y: Float64[Tensor, "B N d"],
-        weight: Float64[Tensor, "B N N"],
-        trust: Float64[Tensor, "B L L"],
-        fixed: Bool[Tensor, "B N"],
-        index: Int64[Tensor, "M"],
-    ) -> Float64[Tensor, "B L L"]:
-        """Cholesky factor of V: the weighted Laplacian (with all components Gauss–Newton's matrix,
-        which takes fewer steps where a network bends easily) and what the prior is worth."""
-        if self.rows == 1:
-            links = joint.laplacian(weight, index)
-        else:
-            links = joint.of_links(y, weight, self.rows, index)
-        return torch.linalg.cholesky_ex(joint.held(links + trust, fixed[:, index])).L
+        return torch.diag_embed(forgotten)
 
     def known(
         self,
-        y: Float64[Tensor, "B N d"],
         weight: Float64[Tensor, "B N N"],
         trust: Float64[Tensor, "B L L"],
         now: Prepared,
         index: Int64[Tensor, "M"],
     ) -> Float64[Tensor, "B N e K"]:
         """The joint covariance of positions."""
-        told = joint.of_links(y, self.told(weight, now), self.rows, index)
+        told = joint.laplacian(self.told(weight, now) / self.process.dim, index)
         part = joint.posterior(told + trust, now.fixed[:, index], now.variance[:, index])
         return joint.whole(part, index, now.variance)
 
     def nearer(
         self,
-        y: Float64[Tensor, "B N d"],
         weight: Float64[Tensor, "B N N"],
         trust: Float64[Tensor, "B L L"],
         now: Prepared,
@@ -145,7 +117,7 @@ class DynamicMds(SwarmFilter):
     ) -> Prepared:
         """The same for worlds that begin, with what is unsure of where they are by now: a prior of
         many noises' width cannot tell good ranges from bad."""
-        together = self.known(y, weight, trust, now, joint.moving(now.fixed))
+        together = self.known(weight, trust, now, joint.moving(now.fixed))
         return replace(now, between=torch.where(begins, joint.between(together), now.between))
 
     def slowed(

@@ -9,13 +9,14 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.checkpoint import learned
-from agents.dwmds import Covariance, DynamicMds
+from agents.dwmds import DynamicMds
 from agents.localizer import Estimate, Localizer, register
 from agents.stgnn.features import Memory, Scene, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
 from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
 from agents.swarm.links import along_links, lengths
+from agents.team_map import RecursiveMap
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -149,8 +150,8 @@ class StDcl(NetworkLoop):
     """ST-DCL whole: ``dwmds_st``, the ST-GNN, and the loop between them.
 
     ``feedback``: ``learned`` (what the shipped weights were trained with), ``paper`` (equation 36),
-    ``none``, ``links``, ``positions``. ``confidence`` and ``covariance``: the optimizer's.
-    ``weights``: a checkpoint's name or path, or ``none``.
+    ``none``, ``links``, ``positions``. ``optimizer``: what the network corrects, and its
+    ``confidence``. ``weights``: a checkpoint's name or path, or ``none``.
     """
 
     name = "stdcl"
@@ -162,9 +163,11 @@ class StDcl(NetworkLoop):
         weights: str = "stdcl",
         feedback: Feedback = "learned",
         confidence: Confidence = "em",
-        covariance: Covariance = "full",
+        optimizer: Literal["dwmds_st", "map"] = "dwmds_st",
     ) -> None:
-        base = DynamicMds(believed, confidence=confidence, covariance=covariance)
+        base = (DynamicMds if optimizer == "dwmds_st" else RecursiveMap)(
+            believed, confidence=confidence
+        )
         super().__init__(base, learned(StGnn, weights), feedback)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.swarm.links import along_links, lengths
@@ -17,21 +17,18 @@ _NOTHING = 1e-10  # m⁻²: information on a UAV that nothing ties to an anchor
 def fisher(
     y: Float64[Tensor, "B N d"],
     weight: Float64[Tensor, "B N N"],
-    index: Int64[Tensor, "M"] | None = None,
-) -> Float64[Tensor, "B M d M d"]:
+) -> Float64[Tensor, "B N d N d"]:
     """Σ_{i<j} W_ij J_ijᵀ J_ij of distances, J the unit vectors along links: a Laplacian of d × d
-    blocks; the rows and columns of the UAVs in ``index`` (None: of all)."""
-    if index is None:
-        index = torch.arange(y.shape[1], device=y.device)
-    b, m, d = y.shape[0], len(index), y.shape[-1]
-    unit = [(c[:, index].unsqueeze(2) - c.unsqueeze(1)) for c in y.unbind(-1)]
-    scale = (weight / lengths(y).square())[:, index]
-    matrix = y.new_empty(b, m, d, m, d)
+    blocks."""
+    b, n, d = y.shape
+    apart = [c.unsqueeze(2) - c.unsqueeze(1) for c in y.unbind(-1)]
+    scale = weight / lengths(y).square()
+    matrix = y.new_empty(b, n, d, n, d)
     for p in range(d):
-        along = scale * unit[p]
+        along = scale * apart[p]
         for q in range(p, d):
-            block = along * unit[q]
-            part = -block[..., index]
+            block = along * apart[q]
+            part = -block
             part.diagonal(dim1=-2, dim2=-1).add_(block.sum(-1))
             matrix[:, :, p, :, q] = part
             if q != p:

@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from agents.swarm.gauss_newton import fisher
-
 _NOTHING = 1e-10  # m⁻²: information on a UAV that nothing is known of
 
 
@@ -92,15 +90,6 @@ def precision(
     return _inverse(whole).masked_fill(tied, 0.0)
 
 
-def of_links(
-    y: Float64[Tensor, "B N d"], weight: Float64[Tensor, "B N N"], e: int, index: Int64[Tensor, "M"]
-) -> Float64[Tensor, "B L L"]:
-    """What ranges of some weights (1/m²) tell at some positions of the UAVs in ``index``."""
-    if e > 1:
-        return fisher(y, weight, index).flatten(3).flatten(1, 2)
-    return laplacian(weight / y.shape[-1], index)
-
-
 def laplacian(
     weight: Float64[Tensor, "B N N"], index: Int64[Tensor, "M"]
 ) -> Float64[Tensor, "B M M"]:
@@ -123,24 +112,6 @@ def posterior(
     known = torch.where(still, variance.repeat_interleave(e, -1), 0.0)
     whole.diagonal(dim1=-2, dim2=-1).add_(known)
     return whole.unflatten(1, (-1, e))
-
-
-def drawn(
-    matrix: Float64[Tensor, "B K K"], x: Float64[Tensor, "B N d"]
-) -> Float64[Tensor, "B N d"]:
-    """A matrix of all components, or of one that stands for all axes, times positions."""
-    if matrix.shape[-1] == x.shape[1]:
-        return matrix @ x
-    return (matrix @ x.flatten(1).unsqueeze(-1))[..., 0].view_as(x)
-
-
-def solved(
-    factor: Float64[Tensor, "B K K"], x: Float64[Tensor, "B N d"]
-) -> Float64[Tensor, "B N d"]:
-    """The same for its inverse, from its Cholesky factor."""
-    if factor.shape[-1] == x.shape[1]:
-        return torch.cholesky_solve(x, factor)
-    return torch.cholesky_solve(x.flatten(1).unsqueeze(-1), factor)[..., 0].view_as(x)
 
 
 def held(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B N"]) -> Float64[Tensor, "B K K"]:
