@@ -26,6 +26,7 @@ _LINKS: tuple[Feedback, ...] = ("paper", "links", "learned")
 _POSITIONS: tuple[Feedback, ...] = ("positions", "learned")
 _RATE = 0.1  # largest change of a link's confidence in a step, as a share
 _LEAST = 0.1  # confidence of a link
+_REACH = 3.0  # standard deviations
 _GAIN = 0.05  # κ of the paper's feedback
 
 
@@ -85,7 +86,8 @@ class NetworkLoop(Localizer[LoopBelief]):
                 now = replace(now, confidence=belief.confidence)
             found = self.base.find(belief.base, now)
             weight, shift = self.base.weigh(found.position, now)
-            scene, memory = look(now, found, weight, shift, self.base.std, belief.memory)
+            reach = self._reach(now, found)
+            scene, memory = look(now, found, weight, shift, self.base.std, belief.memory, reach)
         correction, past = self.network(scene, belief.past)
         if torch.is_grad_enabled():
             found = replace(found, position=found.position + _owed(belief, now, scene, shift))
@@ -105,6 +107,12 @@ class NetworkLoop(Localizer[LoopBelief]):
 
     def diagnostics(self, belief: LoopBelief) -> dict[str, Float64[Tensor, "B N"]]:
         return self.base.diagnostics(belief.base)
+
+    def _reach(self, now: Prepared, found: Found) -> Float64[Tensor, "B N"]:
+        """The largest correction (m): three standard deviations of a position, or of what a step's
+        links have told of it if that is less. So who hears nobody is not moved."""
+        told = (now.variance - found.variance).clamp_min(0.0)
+        return _REACH * torch.minimum(found.variance, told).sqrt()
 
     def _fed_back(
         self, old: Float64[Tensor, "B N N"], now: Prepared, best: Found, correction: Correction
@@ -134,10 +142,11 @@ def _owed(
 
 
 def _corrected(now: Prepared, found: Found, correction: Correction) -> Found:
-    """p̂ = p + γ Δp (eq. 34) and its variance; who is fixed stays."""
+    """p̂ = p + γ Δp (eq. 34) and its variance, dead reckoning's at most; who is fixed stays."""
     moves = ~now.fixed
     position = found.position + correction.offset.double()
-    variance = torch.where(moves, found.variance * correction.spread.double(), found.variance)
+    variance = torch.minimum(found.variance * correction.spread.double(), now.variance)
+    variance = torch.where(moves, variance, found.variance)
     return Found(
         torch.where(moves.unsqueeze(-1), position, found.position),
         variance,
@@ -190,3 +199,7 @@ class StGat(NetworkLoop):
     def __init__(self, believed: Believed, *, weights: str = "stgat") -> None:
         network = learned(StGnn, weights, kinematic=False)
         super().__init__(_Reckoned(believed, "none"), network, "positions")
+
+    def _reach(self, now: Prepared, found: Found) -> Float64[Tensor, "B N"]:
+        """Three standard deviations of dead reckoning."""
+        return _REACH * now.variance.sqrt()

@@ -60,7 +60,7 @@ class Scene:
     weight: Float64[Tensor, "B N N"]
     gain: Float64[Tensor, "B N d d"]
     trust: Float64[Tensor, "B N"]
-    spread: Float64[Tensor, "B N"]
+    reach: Float64[Tensor, "B N"]
 
     def to(self, like: Tensor) -> "Scene":
         """The same in another precision."""
@@ -87,9 +87,10 @@ def look(
     shift: Float64[Tensor, "B N N"],
     std: float,
     memory: Memory,
+    reach: Float64[Tensor, "B N"],
 ) -> tuple[Scene, Memory]:
     """The scene of a step whose optimizer has ``found`` positions with those weights (1/m²) and
-    shifts (m), and the memory after it."""
+    shifts (m), with corrections up to ``reach`` (m), and the memory after it."""
     mask, d = now.links.mask, found.position.shape[-1]
     y = found.position - found.position.mean(1, keepdim=True)
     length = lengths(y)
@@ -126,7 +127,7 @@ def look(
             speed / 4)  # fmt: skip
     moves = ~now.fixed
     seen = (scalars, vectors, torch.stack(link, -1), mask, moves, y, length, certain, gain, trust)
-    return Scene(*seen, found.variance.sqrt()), memory
+    return Scene(*seen, reach), memory
 
 
 def _vagueness(now: Prepared, weight: Float64[Tensor, "B N N"], dim: int) -> Float64[Tensor, "B N"]:

@@ -15,7 +15,7 @@ from agents.stgnn.layers import DilatedConvolution, TopologicalAttention, bounde
 DILATIONS = (1, 2, 4)
 _CARRIED = 4  # vector channels that neighbours' displacements come in
 _EDGE = 8
-_REACH = 3.0  # standard deviations of a position: the largest correction
+_LEAST = 1e-9  # m
 _WIDEST = 3.0  # of a factor of a standard deviation, as a logarithm
 
 
@@ -108,8 +108,8 @@ class StGnn(Learned):
             h, v = hop(scene, h, v)
         h, v, past = self._in_time(h, v, past)
         raw = (v * self.out(h).unsqueeze(-2)).sum(-1)
-        most = _REACH * scene.spread.unsqueeze(-1)
-        size = raw.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        most = scene.reach.clamp_min(_LEAST).unsqueeze(-1)
+        size = raw.norm(dim=-1, keepdim=True).clamp_min(_LEAST)
         trust = self._gamma(scene).unsqueeze(-1)
         offset = trust * most * torch.tanh(size / most) * (raw / size)
         spread = torch.exp(_WIDEST * torch.tanh(self.sure(h)[..., 0] / _WIDEST))

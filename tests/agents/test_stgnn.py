@@ -69,13 +69,17 @@ def nothing(n: int = N) -> Memory:
     return forgotten(2, n, 3, torch.device("cpu"))
 
 
+def reach(found: Found) -> Tensor:
+    return 3.0 * found.variance.sqrt()
+
+
 def answered(network: StGnn, *steps: Any) -> list[Any]:
     """The network's corrections over some steps."""
     memory, past, found = None, None, []
     for now, where, weight, shift in steps:
         memory = nothing(now.fixed.shape[1]) if memory is None else memory
         past = network.start(now.fixed.shape, 3) if past is None else past
-        scene, memory = look(now, where, weight, shift, STD, memory)
+        scene, memory = look(now, where, weight, shift, STD, memory, reach(where))
         correction, past = network(scene, past)
         found.append(correction)
     return found
@@ -151,7 +155,7 @@ def test_lengths_in_other_units_give_the_same_corrections() -> None:
     (one,) = answered(network, (now, found, weight, shift))
     memory, past = nothing(), network.start(now.fixed.shape, 3)
     scaled = Found(c * found.position, c**2 * found.variance)
-    scene, _ = look(small, scaled, weight / c**2, c * shift, c * STD, memory)
+    scene, _ = look(small, scaled, weight / c**2, c * shift, c * STD, memory, reach(scaled))
     other, _ = network(scene, past)
     assert torch.allclose(other.offset, c * one.offset, rtol=1e-7, atol=1e-9)
 
@@ -223,7 +227,7 @@ def test_the_receptive_field_in_time() -> None:
 
 def test_attention_is_a_mean_over_links_and_cuts_the_doubtful_and_fast() -> None:
     step = moment(7)
-    scene, _ = look(*step, STD, nothing())
+    scene, _ = look(*step, STD, nothing(), reach(step[1]))
     layer = TopologicalAttention(16, scene.vectors.shape[-1], 4).double().requires_grad_(False)
     mapped = torch.randn(2, N, 16, generator=torch.Generator().manual_seed(1)).double()
     share = layer.attention(scene, mapped)
@@ -241,7 +245,7 @@ def test_attention_is_a_mean_over_links_and_cuts_the_doubtful_and_fast() -> None
 
 def test_information_and_carried_displacements_are_what_sums_over_links_give() -> None:
     step = moment(9)
-    scene, _ = look(*step, STD, nothing())
+    scene, _ = look(*step, STD, nothing(), reach(step[1]))
     y = scene.position
     unit = (y.unsqueeze(2) - y.unsqueeze(1)) / scene.length.unsqueeze(-1)
     blocks = torch.einsum("bij,bijx,bijy->bixy", scene.weight, unit, unit)
@@ -258,7 +262,7 @@ def test_corrections_are_bounded_and_spare_who_is_fixed() -> None:
     network = stirred(11)
     network.out.bias += 1e6
     (correction,) = answered(network, (now, found, weight, shift))
-    most = 3.0 * found.variance.sqrt()
+    most = reach(found)
     assert (correction.offset.norm(dim=-1) <= most + 1e-9).all()
     assert (correction.offset[now.fixed] == 0).all()
 

@@ -94,7 +94,7 @@ def test_gradient_of_one_step_is_that_of_finite_differences(recorded: SimpleName
                 values.append(total(loss(batch)))
             flat[i] = before
             expected = (values[0] - values[1]) / 2e-5
-            assert slope[i].item() == pytest.approx(expected, rel=1e-4, abs=1e-8), name
+            assert slope[i].item() == pytest.approx(expected, rel=1e-3, abs=1e-8), name
             moved += abs(expected) > 1e-7
     assert moved >= 20
 
@@ -125,7 +125,8 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
             now = loop.base.prepared(belief.base, observation)
             found = loop.base.find(belief.base, loops.replace(now, confidence=confidence))
             weight, off = loop.base.weigh(found.position, now)
-            scene, _ = loops.look(now, found, weight, off, loop.base.std, belief.memory)
+            reach = loop._reach(now, found)
+            scene, _ = loops.look(now, found, weight, off, loop.base.std, belief.memory, reach)
             owed = loops._owed(belief, now, scene, off)
         return found.position.detach() + owed, state
 
