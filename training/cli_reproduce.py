@@ -16,10 +16,11 @@ class Paper(StrEnum):
 
     pfnn = "pfnn"
     nnhpff = "nnhpff"
+    stdcl = "stdcl"
     marl = "marl"
 
 
-_RUNS = {Paper.pfnn: 20, Paper.nnhpff: 100, Paper.marl: 40}
+_RUNS = {Paper.pfnn: 20, Paper.nnhpff: 100, Paper.stdcl: 50, Paper.marl: 40}
 
 
 class Part(StrEnum):
@@ -27,18 +28,39 @@ class Part(StrEnum):
 
     paper = "paper"
     robustness = "robustness"
+    stress = "stress"
+    learned = "learned"
+    campus = "campus"
+    real = "real"
     all = "all"
 
 
+_PARTS = {
+    Paper.pfnn: (Part.paper, Part.robustness, Part.all),
+    Paper.nnhpff: (Part.paper, Part.robustness, Part.all),
+    Paper.stdcl: (Part.paper, Part.stress, Part.learned, Part.campus, Part.real, Part.all),
+    Paper.marl: (Part.all,),
+}
+
+
 def reproduce(
-    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **nnhpff**, **marl**")],
+    paper: Annotated[
+        Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **nnhpff**, **stdcl**, **marl**")
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report and store.")],
     part: Annotated[
-        Part, typer.Option(help="The paper's own tables and figures, the study beyond, or both.")
+        Part,
+        typer.Option(
+            help="The paper's own tables and figures, the study beyond (of **stdcl**: stress, the "
+            "learned part, campus flights, recordings), or all."
+        ),
     ] = Part.all,
     runs: Annotated[
         int | None,
-        typer.Option(help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff, 40 for marl."),
+        typer.Option(
+            help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff, 50 for **stdcl** (a "
+            "tenth beyond its main table), 40 for marl."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first world.")] = 0,
     agents: Annotated[
@@ -86,6 +108,10 @@ def reproduce(
 
     coloc reproduce nnhpff --out results/nnhpff --jobs 2
 
+    coloc reproduce stdcl --out results/stdcl --jobs 2
+
+    coloc reproduce stdcl --out results/stdcl --part stress --variants nlos-0.15,nlos-0.5
+
     coloc reproduce marl --out results/marl --jobs 2
     """
     for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
@@ -103,6 +129,7 @@ def reproduce(
     from training.reproduce.marl.run import reproduce as run_marl
     from training.reproduce.nnhpff.run import reproduce as run_nnhpff
     from training.reproduce.pfnn.run import reproduce as run_pfnn
+    from training.reproduce.stdcl.run import reproduce as run_stdcl
 
     torch.set_num_threads(1)
     wanted = None if agents is None else split_agents(agents)
@@ -111,14 +138,19 @@ def reproduce(
         shutil.rmtree(out / "store", ignore_errors=True)
     if paper is Paper.marl and (agents or steps or part is not Part.all):
         raise ValueError("marl takes no --agents, --part or --steps")
-    if paper is Paper.nnhpff and agents:
-        raise ValueError("nnhpff takes no --agents")
+    if paper in (Paper.nnhpff, Paper.stdcl) and agents:
+        raise ValueError(f"{paper.value} takes no --agents")
+    if part not in _PARTS[paper]:
+        allowed = ", ".join(each.value for each in _PARTS[paper])
+        raise ValueError(f"{paper.value} has no part {part.value!r}: {allowed} are allowed")
     fly, count = not report_only, runs or _RUNS[paper]
     with progress() as tell:
         if paper is Paper.marl:
             run_marl(out, count, seed, where, jobs, fly, tell, _say)
         elif paper is Paper.nnhpff:
             run_nnhpff(out, part.value, count, seed, where, steps, jobs, fly, tell, _say)
+        elif paper is Paper.stdcl:
+            run_stdcl(out, part.value, count, seed, where, steps, jobs, fly, tell, _say)
         else:
             run_pfnn(out, part.value, count, seed, wanted, where, steps, jobs, fly, tell, _say)
     typer.echo(f"written to {out}/report.md")

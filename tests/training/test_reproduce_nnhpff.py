@@ -11,10 +11,17 @@ from sklearn import metrics
 from agents import make
 from coloc_env.scenarios import make_scenario
 from training.reproduce.nnhpff import detection, plan
-from training.reproduce.nnhpff.claims import away_from_zero, verdicts
+from training.reproduce.nnhpff.claims import verdicts
 from training.reproduce.nnhpff.measures import HELD, Runs
 from training.reproduce.nnhpff.run import NAMES, reproduce
-from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, Difference
+from training.reproduce.verdicts import (
+    CONTRADICTED,
+    NOT,
+    REPRODUCED,
+    UNKNOWN,
+    Difference,
+    away_from_zero,
+)
 from training.results import AgentResult, Results
 
 RUNS, STEPS = 12, 360

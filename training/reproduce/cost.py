@@ -69,14 +69,21 @@ def measure(
 
 
 def measured(
-    store: Store, variant: Variant, seed: int, agents: Sequence[str], tell: Progress
+    store: Store,
+    variant: Variant,
+    seed: int,
+    agents: Sequence[str],
+    tell: Progress,
+    missing: bool = True,
 ) -> dict[str, Cost]:
-    """The cost of agents, from the store if it is there."""
+    """The cost of agents, from the store if it is there; ``missing=False`` measures nothing."""
     if not agents:
         return {}
     name = f"{variant.key}/cost-{seed}"
     settings = {"cost": [Piece(variant, agent, seed, 1).settings() for agent in agents]}
     if not store.has(name, settings):
+        if not missing:
+            return {}
         found = measure(variant.build(), agents, seed, tell)
         facts = {agent: [one.belief, one.working] for agent, one in found.items()}
         store.save(name, settings, {agent: one.ms for agent, one in found.items()}, facts)

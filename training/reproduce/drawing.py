@@ -1,6 +1,6 @@
 """What figures of reports have in common."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import matplotlib as mpl
@@ -23,6 +23,16 @@ def save(drawing: Callable[[], Figure], file: Path) -> None:
 def caption(drawing: Callable[..., Figure]) -> str:
     """A drawing's docstring, as what stands below it."""
     return " ".join((drawing.__doc__ or "").split())
+
+
+def draw(drawings: Mapping[str, Callable[[], Figure]], folder: Path) -> list[str]:
+    """Write figures; the lines that show them, each drawing's docstring as its caption."""
+    text: list[str] = []
+    for name, drawn in drawings.items():
+        save(drawn, folder / name)
+        words = caption(getattr(drawn, "func", drawn))
+        text += [f"![{words}]({name})", "", f"*{words}*", ""]
+    return text
 
 
 def headline(figure: Figure, title: str) -> None:

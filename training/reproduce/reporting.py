@@ -2,9 +2,11 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from training.metrics import Difference
 from training.reproduce import verdicts
@@ -14,6 +16,7 @@ from training.results import plain, table
 
 DASH = "–"
 Text = list[str]
+Table = tuple[list[str], list[list[str]]]  # header and lines
 
 
 def difference(found: Difference, scale: float, unit: str, sign: bool = True) -> str:
@@ -23,6 +26,21 @@ def difference(found: Difference, scale: float, unit: str, sign: bool = True) ->
         for x in (found.mean, found.low, found.high)
     )
     return f"{mean}{unit and ' '}{unit} ({low} to {high})"
+
+
+def ends(x: Difference, form: Callable[[float], str] = "{:.3f}".format) -> str:
+    """A mean with its interval; a dash for NaN."""
+    if np.isnan(x.mean):
+        return DASH
+    if not np.isfinite([x.low, x.high]).all():
+        return form(x.mean)
+    return f"{form(x.mean)} ({form(x.low)} to {form(x.high)})"
+
+
+def section(title: str, content: Table, left: int) -> Text:
+    """A titled table, ``left`` columns of which are words; nothing if it has no lines."""
+    header, lines = content
+    return [f"### {title}", "", *table(header, lines, left=left), ""] if lines else []
 
 
 def counts(judged: Sequence[Verdict]) -> str:

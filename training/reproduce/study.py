@@ -1,11 +1,13 @@
 """Agents in variants of scenarios: what is to be flown, and the results put together again.
 
 A piece of work is one agent in one variant over a block of seeds, or (agent ``WORLD``) the worlds
-themselves with their bound. More runs of the same are another block, so that tables over 20 runs
-and a figure over 30 share what they can; and whatever was computed for one table serves all.
+themselves, with their bound unless the variant says otherwise, or a bound alone (``BOUNDS``), which
+may take longer than all flights and need fewer runs. More runs of the same are another block, so
+that tables over 20 runs and a figure over 30 share what they can; and whatever was computed for one
+table serves all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -14,7 +16,7 @@ import numpy as np
 import torch
 
 from agents.localizer import make
-from coloc_env.bounds import Bound
+from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from training.evaluate import Progress, evaluate
@@ -23,18 +25,24 @@ from training.reproduce.store import Arrays, Store
 from training.results import AgentResult, Results
 
 WORLD = "dead_reckoning"  # flown with the bound, for the worlds' truth: it applies to all of them
+BOUNDS: dict[str, Callable[[Scenario, int, int], Bound]] = {
+    "posterior_bound": posterior_bound,
+    "snapshot_bound": snapshot_bound,
+}
 _SERIES = "series."
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A scenario with some overrides, known by ``key``; at most ``steps`` long."""
+    """A scenario with some overrides, known by ``key``; at most ``steps`` long. ``bounded``:
+    its worlds are flown with their posterior bound."""
 
     key: str
     title: str
     overrides: tuple[tuple[str, Any], ...] = ()
     scenario: str = "indoor-v0"
     steps: int | None = None
+    bounded: bool = True
 
     def build(self) -> Scenario:
         """ValueError or OSError where it cannot be (recordings that are not there)."""
@@ -75,7 +83,7 @@ def _built(variant: Variant) -> Scenario:
 @cache
 def _settings(piece: Piece) -> dict[str, Any]:
     scenario = piece.variant.build()
-    localizer = make(piece.agent, scenario)
+    localizer = make(WORLD if piece.agent in BOUNDS else piece.agent, scenario)
     return {
         "scenario": scenario.name,
         "overrides": dict(piece.variant.overrides),
@@ -83,6 +91,7 @@ def _settings(piece: Piece) -> dict[str, Any]:
         "seed": piece.seed,
         "runs": piece.runs,
         "agent": piece.agent,
+        "bounded": piece.variant.bounded,
         "weights": weights_of(localizer),
         "code": code_of(localizer),
         "torch": str(torch.__version__),
@@ -90,18 +99,22 @@ def _settings(piece: Piece) -> dict[str, Any]:
 
 
 def compute(piece: Piece, store: Store, progress: Progress | None = None) -> None:
-    """Fly a piece and store what came of it."""
+    """Fly a piece, or compute a bound, and store what came of it."""
     settings = piece.settings()
     scenario, of_world = piece.variant.build(), piece.agent == WORLD
-    found = evaluate(scenario, [piece.agent], piece.runs, piece.seed, progress, bound=of_world)
+    if piece.agent in BOUNDS:
+        known = BOUNDS[piece.agent](scenario, piece.runs, piece.seed)
+        store.save(piece.name, settings, _bound_arrays(known), {})
+        return
+    with_bound = of_world and piece.variant.bounded
+    found = evaluate(scenario, [piece.agent], piece.runs, piece.seed, progress, bound=with_bound)
     one = found.agents[piece.agent]
     arrays: Arrays = {"offset": one.offset, "nees": one.nees, "broken": one.broken}
     arrays |= {_SERIES + key: values for key, values in one.series.items()}
     if of_world:
         arrays |= {"truth": found.truth, "attitude": found.attitude, "scored": found.scored}
         if found.bound is not None:
-            arrays["bound_mse"] = found.bound.mse.numpy()
-            arrays["bound_scored"] = found.bound.scored.numpy()
+            arrays |= _bound_arrays(found.bound)
     facts = {
         "raised": one.raised,
         "message": one.message,
@@ -109,6 +122,10 @@ def compute(piece: Piece, store: Store, progress: Progress | None = None) -> Non
         "start": found.truth[:, 0].tolist(),
     }
     store.save(piece.name, settings, arrays, facts)
+
+
+def _bound_arrays(known: Bound) -> Arrays:
+    return {"bound_mse": known.mse.numpy(), "bound_scored": known.scored.numpy()}
 
 
 class Study:
@@ -176,6 +193,16 @@ class Study:
             bound=bound,
             agents=found,
         )
+
+    def bound(self, variant: Variant, which: str, runs: int) -> Bound | None:
+        """One of ``BOUNDS`` over the first ``runs`` runs; None if it could not be computed."""
+        if (variant.key, which) in self.failed:
+            return None
+        (piece,) = self.pieces(variant, which, runs)
+        arrays, _ = self._load(piece)
+        kind = SnapshotBound if which == "snapshot_bound" else Bound
+        mse, scored = (torch.from_numpy(arrays[f"bound_{key}"]) for key in ("mse", "scored"))
+        return kind(mse, scored, variant.build().arena.dt)
 
     def _load(self, piece: Piece) -> tuple[Arrays, dict[str, Any]]:
         return self.store.load(piece.name, piece.settings())

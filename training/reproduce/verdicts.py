@@ -96,6 +96,13 @@ def gain(ours: Floats, other: Floats, level: float = 0.95) -> Difference:
     return Difference(*(scale * x for x in (difference.mean, difference.low, difference.high)))
 
 
+def away_from_zero(difference: Difference) -> Difference:
+    """The interval of a difference's size."""
+    ends = abs(difference.low), abs(difference.high)
+    low = 0.0 if difference.low < 0 < difference.high else min(ends)
+    return Difference(abs(difference.mean), low, max(ends))
+
+
 def least(differences: list[tuple[Floats, Floats]]) -> Difference:
     """The smallest of several gains in per cent, of ``(ours, other)`` each; the level is split
     among them (Bonferroni), since the smallest was picked."""

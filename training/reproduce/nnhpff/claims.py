@@ -7,7 +7,15 @@ import numpy as np
 
 from training.metrics import Difference, Floats
 from training.reproduce.nnhpff.measures import Runs
-from training.reproduce.verdicts import Claim, Verdict, decide, gain, interval, share
+from training.reproduce.verdicts import (
+    Claim,
+    Verdict,
+    away_from_zero,
+    decide,
+    gain,
+    interval,
+    share,
+)
 
 NEAR = 5.0  # per cent: as near as this counts as equal (our reading of "nearly identical")
 OFTEN = 10  # times as many resets: our reading of "very frequently" beside none
@@ -82,13 +90,6 @@ def _gain(one: Runs, other: Runs) -> Difference:
 def _apart(one: Runs, other: Runs) -> Difference:
     """How far two ALEs lie apart, in per cent of the second's, whichever is larger."""
     return away_from_zero(gain(one.ale(), other.ale()))
-
-
-def away_from_zero(difference: Difference) -> Difference:
-    """The interval of a difference's size."""
-    ends = abs(difference.low), abs(difference.high)
-    low = 0.0 if difference.low < 0 < difference.high else min(ends)
-    return Difference(abs(difference.mean), low, max(ends))
 
 
 def _resets(one: Runs) -> Difference:

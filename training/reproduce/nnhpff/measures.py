@@ -7,7 +7,7 @@ import numpy as np
 from training import metrics
 from training.metrics import Flags, Floats
 from training.nnhpff import FAILED
-from training.results import AgentResult, Results
+from training.reproduce.runs import AgentRuns
 
 FIRST_CORNER = 100  # step
 SETTLED = 20  # step from which a filter's start is over
@@ -16,20 +16,8 @@ WITHIN = 100  # steps in which a recovery counts
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class Runs(AgentRuns):
     """An agent's runs in a variant."""
-
-    results: Results
-    agent: str
-
-    @property
-    def one(self) -> AgentResult:
-        return self.results.agents[self.agent]
-
-    @property
-    def error(self) -> Floats:
-        """[R, K, N] m."""
-        return self.one.error
 
     @property
     def resets(self) -> Floats:

@@ -12,9 +12,8 @@ from training.reproduce.nnhpff import figures, plan, tables
 from training.reproduce.nnhpff.claims import verdicts as judge
 from training.reproduce.nnhpff.flown import Flown
 from training.reproduce.nnhpff.measures import WITHIN, Runs
-from training.reproduce.reporting import Text
+from training.reproduce.reporting import Text, section
 from training.reproduce.study import Variant
-from training.results import table
 
 FILES = (
     "figure_4_learning.png",
@@ -41,8 +40,8 @@ def paper_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> Text
     text = ["## The paper's claims", "", verdicts.RULE, "", reporting.counts(judged), ""]
     text += reporting.claims(judged)
     text += ["", f"`wsn-v0`, {runs} runs; means with 95 % intervals over runs.", ""]
-    text += _table("Errors and resets (figures 5 to 8)", tables.errors(titled), 2)
-    text += _table("Table 1: time of a localization, 5000 particles", tables.costs(flown), 1)
+    text += section("Errors and resets (figures 5 to 8)", tables.errors(titled), 2)
+    text += section("Table 1: time of a localization, 5000 particles", tables.costs(flown), 1)
     machine = platform.processor() or platform.machine()
     text += [
         f"Case 1, one world, one thread ({machine}), all filters step by step in turn. The paper's "
@@ -57,7 +56,7 @@ def paper_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> Text
             drawings[name] = partial(figures.case, title[0].upper() + title[1:], there)
     if any(titled.values()):
         drawings[FILES[4]] = partial(figures.ales, titled)
-    text += _draw(drawings, folder)
+    text += drawing.draw(drawings, folder)
     content = {
         "runs": runs,
         "claims": [reporting.as_json(each) for each in judged],
@@ -82,37 +81,37 @@ def detector_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> T
         "scenarios never seen": flown.detections(plan.never_seen(steps), runs),
     }
     text = ["## The detector", "", f"{runs} worlds a scenario; nothing is restarted here.", ""]
-    text += _table("As a classifier", tables.detectors(samples, THRESHOLD), 2)
-    text += _table(f"Confusion at {THRESHOLD:g}", tables.confusions(samples, THRESHOLD), 2)
+    text += section("As a classifier", tables.detectors(samples, THRESHOLD), 2)
+    text += section(f"Confusion at {THRESHOLD:g}", tables.confusions(samples, THRESHOLD), 2)
     both = {
         title: group
         for title, group in samples.items()
         if group is not None and 0 < group.failed.sum() < group.failed.size
     }
     drawings = {FILES[5]: partial(figures.detector, both)} if both else {}
-    return text + _draw(drawings, folder)
+    return text + drawing.draw(drawings, folder)
 
 
 def beyond_part(flown: Flown, runs: int, steps: int | None, folder: Path) -> Text:
     """The study beyond the paper; its lines for the report."""
     text = ["## Beyond the paper", ""]
     moved = _all(flown, plan.sensitivity(steps), runs)
-    text += _table("How σ, M, Q and the quantile move it", tables.errors(moved), 2)
+    text += section("How σ, M, Q and the quantile move it", tables.errors(moved), 2)
     taken: Kidnapped = {
         variant.title: (there, plan.kidnapped_step(variant), plan.kidnapped_uavs(variant))
         for variant, agents in plan.kidnapping(steps)
         if plan.kidnapped_step(variant) + WITHIN <= variant.build().horizon
         and (there := flown.runs(variant, agents, plan.runs_in(variant, runs)))
     }
-    text += _table("Recovery from kidnapping", tables.recoveries(taken), 2)
+    text += section("Recovery from kidnapping", tables.recoveries(taken), 2)
     drawings = {FILES[6]: partial(figures.kidnapping, taken)} if taken else {}
-    text += _draw(drawings, folder)
-    text += _table(
+    text += drawing.draw(drawings, folder)
+    text += section(
         "An anchor that is always NLOS",
         tables.plain_errors(_all(flown, plan.blocked(steps), runs), "runs lost"),
         2,
     )
-    text += _table(
+    text += section(
         "Recordings (the runs differ in what is drawn at their start)",
         tables.plain_errors(_all(flown, plan.recordings(steps), runs), "runs lost"),
         2,
@@ -129,18 +128,3 @@ def _all(
 
 def _methods(there: Mapping[str, Runs]) -> dict[str, Runs]:
     return {agent: there[agent] for agent in plan.METHODS if agent in there}
-
-
-def _table(title: str, content: tables.Table, left: int) -> Text:
-    header, lines = content
-    return [f"### {title}", "", *table(header, lines, left=left), ""] if lines else []
-
-
-def _draw(drawings: Mapping[str, Callable[[], Figure]], folder: Path) -> Text:
-    """Write figures; the lines that show them, each drawing's docstring as its caption."""
-    text: Text = []
-    for name, drawn in drawings.items():
-        drawing.save(drawn, folder / name)
-        words = drawing.caption(getattr(drawn, "func", drawn))
-        text += [f"![{words}]({name})", "", f"*{words}*", ""]
-    return text

@@ -1,18 +1,16 @@
 """The report's tables, as a header and lines."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
-from training.metrics import Difference
 from training.reproduce.nnhpff.detection import calibration, confusion, curve
 from training.reproduce.nnhpff.flown import Detections, Flown
 from training.reproduce.nnhpff.measures import WITHIN, Runs
-from training.reproduce.reporting import DASH
+from training.reproduce.reporting import Table, ends
 from training.reproduce.verdicts import interval
 from training.results import short
 
-Table = tuple[list[str], list[list[str]]]
 PAPER_MS = {"pf": 4.15, "hpff": 4.55, "nnhpff": 7.01}
 
 
@@ -162,12 +160,3 @@ def first_reset(one: Runs) -> str:
     if not reset.any():
         return "never"
     return f"{np.median(step[reset]):.0f} ({100 * reset.mean():.0f} % of runs)"
-
-
-def ends(x: Difference, form: Callable[[float], str] = "{:.3f}".format) -> str:
-    """A mean with its interval; a dash for NaN."""
-    if np.isnan(x.mean):
-        return DASH
-    if not np.isfinite([x.low, x.high]).all():
-        return form(x.mean)
-    return f"{form(x.mean)} ({form(x.low)} to {form(x.high)})"

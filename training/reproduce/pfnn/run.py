@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from agents.localizer import make
 from coloc_env.options import unknown
@@ -27,14 +26,13 @@ from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study, Variant
 from training.staging import staged_folder
 
-Part = Literal["paper", "robustness", "all"]
 NAMES = (*report.FILES, "report.md")
 _STORE = "store"
 
 
 def reproduce(
     out: Path,
-    part: Part,
+    part: str,
     runs: int,
     seed: int,
     agents: Sequence[str] | None,

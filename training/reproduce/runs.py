@@ -1,0 +1,28 @@
+"""An agent's runs in a variant, as papers' figures and claims look at them."""
+
+from dataclasses import dataclass
+
+from training.metrics import Flags, Floats
+from training.results import AgentResult, Results
+
+
+@dataclass(frozen=True, eq=False)
+class AgentRuns:
+    """An agent's runs in a variant."""
+
+    results: Results
+    agent: str
+
+    @property
+    def one(self) -> AgentResult:
+        return self.results.agents[self.agent]
+
+    @property
+    def error(self) -> Floats:
+        """[R, K, N] m."""
+        return self.one.error
+
+    @property
+    def scored(self) -> Flags:
+        """[R, K, N]."""
+        return self.results.scored

@@ -1,0 +1,130 @@
+"""What the learned part adds, a long run, and a link through an NLOS event (figure 14)."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from coloc_env.render.style import MUTED
+from training import metrics
+from training.reproduce.drawing import panels
+from training.reproduce.stdcl import plan
+from training.reproduce.stdcl.figures import seconds
+from training.reproduce.stdcl.flown import Teams
+from training.reproduce.stdcl.links import LOW, Event, Loop, Watched
+from training.reproduce.stdcl.looks import legend, log, look, name
+from training.reproduce.stdcl.tables import spread
+from training.reproduce.study import WORLD
+from training.reproduce.verdicts import interval
+
+_PARTED = (plan.WHOLE, plan.OPTIMIZER, "dwmds", "vmds", WORLD)
+_SHOWN = 8.0  # s before and after an event
+_STEPS = ("#bdbdbd", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#332288", "#999999")
+
+
+def ablation(found: Mapping[str, Teams], agents: Mapping[str, str]) -> Figure:
+    """RMSE step by step from the optimizer to the whole, with 95 % intervals over runs; all worlds
+    but the first are held out of training."""
+    figure, ((axes,),) = panels(1, 1, (11.0, 4.2), "What each part adds")
+    shown = [agent for agent in agents if any(agent in there for there in found.values())]
+    width = 0.84 / max(1, len(shown))
+    for i, agent in enumerate(shown):
+        at, told = [], []
+        for j, there in enumerate(found.values()):
+            if agent in there:
+                at.append(j + (i - 0.5 * (len(shown) - 1)) * width)
+                told.append(interval(there[agent].rmse))
+        half = np.transpose([spread(x) for x in told])
+        colour = _STEPS[i % len(_STEPS)]
+        axes.bar(at, [x.mean for x in told], 0.92 * width, color=colour, label=agents[agent])
+        axes.errorbar(at, [x.mean for x in told], half, fmt="none", ecolor="black", elinewidth=0.8)
+    axes.set_xticks(range(len(found)), list(found), fontsize=8.5)
+    axes.set_ylabel("RMSE (m)")
+    tops = [there[a].whole for there in found.values() for a in plan.ABLATION if a in there]
+    if tops:
+        axes.set_ylim(0, 1.6 * max(tops))  # what diverges leaves the picture
+    axes.grid(False, axis="x")
+    legend(figure, [axes], 4)
+    return figure
+
+
+def long_run(there: Teams, loop: Loop | None) -> Figure:
+    """A run ten times as long: RMSE over time, and how far the loop moves links' confidences: the
+    largest change of any link in a step, and their mean."""
+    figure, ((error,), (change,)) = panels(2, 1, (9.0, 5.6), "The loop over 1000 steps")
+    for i, (agent, one) in enumerate(there.items()):
+        style = look(agent, i) | {"linewidth": 1.0}
+        error.plot(seconds(one.per_step, one.results.dt), one.per_step, **style)
+    error.set(ylabel="RMSE (m)", xlabel="time (s)")
+    log(error)
+    error.legend(fontsize=8)
+    if loop is not None:
+        steps = np.arange(len(loop.change))
+        change.plot(
+            steps, 100 * loop.change, color="#D55E00", linewidth=0.8, label="largest change"
+        )
+        change.axhline(10, color=MUTED, linewidth=0.8, linestyle=":")
+        change.plot(steps, 100 * loop.mean, color="#0072B2", label="mean confidence")
+        change.legend(fontsize=8)
+    change.set(xlabel="step", ylabel="%", ylim=(0, 105))
+    return figure
+
+
+def link(found: Mapping[str, Watched], event: Event) -> Figure:
+    """Figure 14: a link of S2 through an NLOS event (grey). (a) its true length, what was measured,
+    and its weight as a multiple of a clean range's; (b) mean error of its two UAVs; without weights
+    for comparison."""
+    figure, grid = panels(2, 1, (9.0, 6.4), f"UAVs {event.i} and {event.j}", sharex=True)
+    (upper,), (lower,) = grid
+    first = next(iter(found.values()))
+    margin = round(_SHOWN / first.dt)
+    part = slice(max(0, event.first - margin), event.last + margin + 1)
+    time = first.dt * np.arange(len(first.error))[part]
+    upper.plot(time, first.length[part, event.i, event.j], color="black", label="true distance")
+    upper.plot(
+        time, first.range[part, event.i, event.j], ".", color="#D62728", markersize=3, label="range"
+    )
+    upper.set(ylabel="m", title="a")
+    weights = upper.twinx()
+    for i, (agent, one) in enumerate(found.items()):
+        style = look(agent, i) | {"linewidth": 1.3}
+        measured = np.isfinite(one.range[part, event.i, event.j])
+        weight = np.where(measured, one.weight[part, event.i, event.j], np.nan)
+        words = f"weight, {name(agent)}"
+        weights.plot(time, weight, marker=".", markersize=2, **(style | {"label": words}))
+        error = one.error[part][:, [event.i, event.j]]
+        lower.plot(time, error.mean(1), **style)
+    weights.axhline(LOW, color=MUTED, linewidth=0.8, linestyle=":")
+    weights.set(ylabel="weight", ylim=(0, 1.6))
+    weights.grid(False)
+    weights.spines["right"].set_visible(True)
+    for axes in (upper, lower):
+        axes.axvspan(first.dt * event.first, first.dt * event.last, color=MUTED, alpha=0.15, lw=0)
+    lower.set(xlabel="time (s)", ylabel="error (m)", title="b")
+    legend(figure, [upper, weights, lower], 4)
+    return figure
+
+
+def parting(there: Teams, watched: Watched | None) -> Figure:
+    """S2: two sub-teams pass a building on both sides. RMSE of each over all runs, and the number
+    of parts of the network in the first one. The first sub-team has the anchors."""
+    figure, grid = panels(3, 1, (9.0, 7.6), "Partition and rejoining", sharex=True)
+    (parts,), *teams = grid
+    if watched is not None:
+        time = watched.dt * np.arange(len(watched.error))
+        parts.step(time, watched.components, color="black", linewidth=1.0)
+        parts.set_ylim(0.5, max(2.5, watched.components.max() + 0.5))
+    parts.set(ylabel="parts of the network", title="a")
+    shown: Sequence[str] = [agent for agent in _PARTED if agent in there]
+    for (axes,), letter, words in zip(teams, "bc", ("first", "second"), strict=True):
+        for i, agent in enumerate(shown):
+            one = there[agent]
+            n = one.error.shape[2]
+            half = slice(0, (n + 1) // 2) if words == "first" else slice((n + 1) // 2, n)
+            error = metrics.rmse_per_step(one.error[:, :, half], one.scored[:, :, half])
+            axes.plot(seconds(error, one.results.dt), error, **look(agent, i))
+        axes.set(ylabel="RMSE (m)", title=f"{letter}  {words} sub-team")
+        log(axes)
+    teams[-1][0].set_xlabel("time (s)")
+    legend(figure, [teams[0][0]])
+    return figure

@@ -1,0 +1,111 @@
+"""``coloc reproduce stdcl``: what is missing is flown, then the report is written."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from coloc_env.options import unknown
+from training.evaluate import Progress
+from training.reproduce.cost import Cost, measured
+from training.reproduce.pool import Note, fly
+from training.reproduce.reporting import failures
+from training.reproduce.stdcl import links, plan, report
+from training.reproduce.stdcl.flown import Flown
+from training.reproduce.stdcl.plan import METHODS, OPTIMIZER, REFERENCES, WHOLE, Plan
+from training.reproduce.store import Store
+from training.reproduce.study import Study, Variant
+from training.staging import staged_folder
+
+NAMES = (*report.FILES, "report.md")
+_STORE = "store"
+_WATCHED = (WHOLE, OPTIMIZER, f"{OPTIMIZER}:confidence=none")
+
+
+def reproduce(
+    out: Path,
+    part: str,
+    runs: int,
+    seed: int,
+    where: Sequence[str] | None,
+    steps: int | None,
+    jobs: int,
+    missing: bool,
+    tell: Progress,
+    note: Note,
+    n_uavs: int = 200,
+) -> None:
+    """Fly what the store in ``out`` lacks, then write the report of ``part`` (one of ``PARTS``, or
+    ``all``) there.
+
+    ``where``: these variants only; None: all. ``steps``: at most so many of each run.
+    ``missing=False`` flies nothing. ``n_uavs``: of ``swarm-v0``, where it is not what is varied.
+    """
+    parts = plan.PARTS if part == "all" else (part,)
+    the, study = Plan(runs, steps, n_uavs), Study(Store(out / _STORE), seed)
+    scenes = plan.merged(scene for each in parts for scene in the.scenes(each))
+    timed = _timed(the, parts)
+    keys = list(dict.fromkeys((*scenes, *(variant.key for variant, _ in timed))))
+    for key in where or ():
+        if key not in keys:
+            raise ValueError(unknown("variant", key, keys))
+    wanted = {key: s for key, s in scenes.items() if where is None or key in where}
+    pieces = [piece for scene in wanted.values() for piece in scene.pieces(study)]
+    if missing:
+        fly(study, pieces, jobs, tell, note)
+    else:
+        study.do_without(pieces)
+    cost: dict[str, dict[str, Cost]] = {}
+    for variant, agents in timed:
+        if where is None or variant.key in where:
+            able = _able(study, variant, agents)
+            cost[variant.key] = measured(study.store, variant, seed, able, tell, missing)
+    flown = _watched(Flown(study, wanted, cost, {}, None), the, tell, missing)
+    text = ["# ST-DCL, reproduced", "", f"{plan.TITLE}.", ""]
+    with staged_folder(out, NAMES) as folder:
+        text += report.claims_part(flown, the, parts, folder)
+        if "paper" in parts:
+            text += report.paper_part(flown, the, folder)
+        if "stress" in parts:
+            text += report.stress_part(flown, the, folder)
+        if "learned" in parts:
+            text += report.learned_part(flown, the, folder)
+        if "campus" in parts:
+            text += report.campus_part(flown, the, folder)
+        if "real" in parts:
+            text += report.real_part(flown, the)
+        text += failures(study)
+        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+
+
+def _timed(the: Plan, parts: Sequence[str]) -> list[tuple[Variant, tuple[str, ...]]]:
+    """Where steps are timed, and whose."""
+    found: list[tuple[Variant, tuple[str, ...]]] = []
+    if "paper" in parts:
+        for n in plan.GROWTH:
+            dear = REFERENCES if n <= plan.JOINT_UP_TO else ()
+            found.append((the.timed(n), (*METHODS, *dear)))
+    if "campus" in parts:
+        found.append((the.flight("s2"), (*METHODS, *REFERENCES)))
+    return found
+
+
+def _able(study: Study, variant: Variant, agents: Sequence[str]) -> list[str]:
+    """Those that can be built; why the others cannot is noted."""
+    study.missing([piece for agent in agents for piece in study.pieces(variant, agent, 1)])
+    return [agent for agent in agents if (variant.key, agent) not in study.failed]
+
+
+def _watched(flown: Flown, the: Plan, tell: Progress, missing: bool) -> Flown:
+    """With the runs in which links are looked at, where their variants are wanted."""
+    study, found = flown.study, flown
+    split, long = the.flight("s2"), the.long()
+    if split.key in flown.scenes and study.can(split):
+        there: dict[str, links.Watched] = {}
+        for agent in _able(study, split, _WATCHED):
+            one = links.watched(study.store, split, agent, study.seed, tell, missing)
+            there |= {} if one is None else {agent: one}
+        found = replace(found, watched=there)
+    if long.key in flown.scenes and _able(study, long, [WHOLE]):
+        loop = links.loop(study.store, long, WHOLE, study.seed, tell, missing)
+        found = replace(found, loop=loop)
+    return found
