@@ -65,10 +65,13 @@ def failures(study: Study) -> Text:
     """What could not be flown, and why."""
     if not study.failed:
         return []
-    agents: dict[tuple[str, str], list[str]] = {}
+    keys: dict[tuple[str, str], list[str]] = {}
     for (key, agent), why in study.failed.items():
-        agents.setdefault((key, why), []).append(f"`{agent}`")
-    lines = [f"- *{key}*, {', '.join(some)}: {why}" for (key, why), some in agents.items()]
+        keys.setdefault((agent, why), []).append(f"*{key}*")
+    agents: dict[tuple[str, str], list[str]] = {}
+    for (agent, why), some in keys.items():
+        agents.setdefault((", ".join(some), why), []).append(f"`{agent}`")
+    lines = [f"- {where}, {', '.join(some)}: {why}" for (where, why), some in agents.items()]
     return ["", "## Not flown", "", *lines]
 
 

@@ -57,11 +57,9 @@ def verdicts(flown: Flown, the: Plan, parts: tuple[str, ...]) -> list[Verdict]:
     for part in parts:
         for claim, needs, figure in by_part.get(part, lambda _: iter(()))(the):
             there = [flown.find(*need) for need in needs]
-            absent = [
-                f"{what} in {key}" for (key, what), x in zip(needs, there, strict=True) if x is None
-            ]
+            absent = [need for need, found in zip(needs, there, strict=True) if found is None]
             if absent:
-                judged.append(decide(claim, None, f"not there: {', '.join(absent)}"))
+                judged.append(decide(claim, None, _not_there(absent)))
             else:
                 judged.append(decide(claim, figure(*there)))
     if "campus" in parts:
@@ -275,6 +273,13 @@ def link_verdicts(flown: Flown) -> list[Verdict]:
 
 
 # ------------------------------------------------------------------ figures
+
+
+def _not_there(absent: list[Need]) -> str:
+    """What a claim lacks, by name."""
+    agents = ", ".join(dict.fromkeys(what.removeprefix("ms:") for _, what in absent))
+    places = list(dict.fromkeys(key for key, _ in absent))
+    return f"not there: {agents} in {places[0]}{' and others' if len(places) > 1 else ''}"
 
 
 def _best(claim: Claim, keys: tuple[str, ...]) -> Case:

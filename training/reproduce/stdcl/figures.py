@@ -9,13 +9,14 @@ from matplotlib.figure import Figure
 
 from coloc_env.bounds import Bound
 from coloc_env.render.style import MUTED
+from training import metrics
 from training.metrics import Floats
 from training.reproduce.cost import Cost
 from training.reproduce.drawing import panels
 from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.flown import Teams
 from training.reproduce.stdcl.looks import OF_SNAPSHOT, WITH_MOTION, legend, log, look, metres, name
-from training.reproduce.stdcl.measures import Runs
+from training.reproduce.stdcl.measures import Runs, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT
 from training.reproduce.stdcl.tables import exponent, medians, spread
 from training.reproduce.verdicts import interval
@@ -121,7 +122,7 @@ def tracks(one: Runs) -> Figure:
 
 def radii(found: Mapping[float, Teams], bounds: Mapping[float, Bounds]) -> Figure:
     """Figure 8: NRMSE by radius of communication, with 95 % intervals over runs; errors in m are
-    divided by that radius. Bounds are means over the same worlds."""
+    divided by that radius. The snapshot's bound is that of the UAVs that one step's ranges localize."""
     figure, ((own, plain),) = panels(1, 2, (11.0, 4.6), "Radius of communication, v_max = 10 m/s")
     agents = dict.fromkeys(agent for there in found.values() for agent in there)
     for axes, scaled in ((own, True), (plain, False)):
@@ -135,7 +136,7 @@ def radii(found: Mapping[float, Teams], bounds: Mapping[float, Bounds]) -> Figur
             )
         for which, style in ((POSTERIOR, WITH_MOTION), (SNAPSHOT, OF_SNAPSHOT)):
             known = {r: b for r, each in bounds.items() if (b := each.get(which)) is not None}
-            height = [b.rmse / (r if scaled else 1.0) for r, b in known.items()]
+            height = [told_by(b) / (r if scaled else 1.0) for r, b in known.items()]
             axes.plot(list(known), height, **style)
         axes.set(xlabel="R (m)")
         log(axes)
@@ -193,7 +194,8 @@ def in_time(axes: Axes, there: Teams, bounds: Bounds) -> None:
     for which, style in ((POSTERIOR, WITH_MOTION), (SNAPSHOT, OF_SNAPSHOT)):
         known = bounds.get(which)
         if known is not None and there:
-            height = known.position.square().nanmean(1).sqrt().numpy() / reach
+            counts = (known.scored & known.mse.isfinite()).numpy()
+            height = metrics.rmse_per_step(known.mse.sqrt().numpy(), counts) / reach
             axes.plot(seconds(height, dt), height, **style)
     axes.set(xlabel="time (s)")
     log(axes)

@@ -98,9 +98,11 @@ def goals(the: Plan) -> Iterator[Goal]:
 
 
 def outcomes(flown: Flown, the: Plan) -> list[Outcome]:
-    """Every goal, measured or not."""
-    found = []
+    """Every goal of what was to be flown, measured or not."""
+    found, asked = [], {*flown.scenes, *flown.cost}
     for goal in dict.fromkeys(goals(the)):
+        if not asked.issuperset(key for key, _ in goal.needs):
+            continue
         there = [flown.find(*need) for need in goal.needs]
         value = goal.figure(*there) if all(x is not None for x in there) else None
         found.append(_outcome(goal, value))

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from coloc_env.bounds import Bound
+from coloc_env.bounds import Bound, SnapshotBound
 from training import metrics
 from training.metrics import Difference, Floats
 from training.reproduce.runs import AgentRuns
@@ -94,6 +94,11 @@ class Runs(AgentRuns):
         if not told.any():
             return float("nan")
         return metrics.rmse(error, told) / float(np.sqrt(mse[told].mean()))
+
+
+def told_by(bound: Bound) -> float:
+    """RMSE (m) that a bound allows, of the UAVs that it says are localizable."""
+    return bound.rmse_localizable if isinstance(bound, SnapshotBound) else bound.rmse
 
 
 def better(ours: Runs, other: Runs) -> Difference:

@@ -11,7 +11,7 @@ from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.figures import Bounds, curve, in_time
 from training.reproduce.stdcl.flown import Teams
 from training.reproduce.stdcl.looks import OF_SNAPSHOT, WITH_MOTION, legend, log, metres
-from training.reproduce.stdcl.measures import Runs
+from training.reproduce.stdcl.measures import Runs, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT
 
 By = Mapping[float, Teams]  # a stressed quantity's values
@@ -87,9 +87,9 @@ def _curves(axes: Axes, found: By, bounds: ByBounds, scale: float, scaled: bool)
         curve(axes, agent, i, own, scaled)
     for which, style in ((POSTERIOR, WITH_MOTION), (SNAPSHOT, OF_SNAPSHOT)):
         known = {
-            x: b.rmse
+            x: told_by(b)
             for x, each in bounds.items()
-            if (b := each.get(which)) is not None and found.get(x) and np.isfinite(b.rmse)
+            if (b := each.get(which)) is not None and found.get(x)
         }
         reach = {x: next(iter(found[x].values())).radius if scaled else 1.0 for x in known}
         axes.plot([scale * x for x in known], [known[x] / reach[x] for x in known], **style)

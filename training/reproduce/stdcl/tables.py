@@ -12,7 +12,7 @@ from training.reproduce.reporting import DASH, Table, difference, ends
 from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.flown import Flown, Teams
 from training.reproduce.stdcl.links import Loop
-from training.reproduce.stdcl.measures import Runs, better
+from training.reproduce.stdcl.measures import Runs, better, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT, Scene
 from training.reproduce.study import WORLD
 from training.reproduce.verdicts import interval
@@ -35,8 +35,8 @@ def averages(found: Mapping[float, Teams], flown: Flown, keys: Mapping[float, st
             known = flown.bound(keys[v_max], which)
             if known is not None and there:
                 reach = next(iter(there.values())).radius
-                start = [f"{v_max:g}", name, f"{known.rmse / reach:.6f}", ""]
-                lines.append([*start, f"{known.rmse:.2f}", "", "", "", "", ""])
+                start = [f"{v_max:g}", name, number(told_by(known) / reach, "{:.6f}"), ""]
+                lines.append([*start, number(told_by(known)), "", "", "", "", ""])
         for agent, one in there.items():
             paper = PAPER_NRMSE[v_max] if agent == plan.WHOLE else None
             lines.append(
