@@ -122,7 +122,7 @@ def tracks(one: Runs) -> Figure:
 
 def radii(found: Mapping[float, Teams], bounds: Mapping[float, Bounds]) -> Figure:
     """Figure 8: NRMSE by radius of communication, with 95 % intervals over runs; errors in m are
-    divided by that radius. The snapshot's bound is that of the UAVs that one step's ranges localize."""
+    divided by that radius. The snapshot's bound: of the UAVs that one step's ranges localize."""
     figure, ((own, plain),) = panels(1, 2, (11.0, 4.6), "Radius of communication, v_max = 10 m/s")
     agents = dict.fromkeys(agent for there in found.values() for agent in there)
     for axes, scaled in ((own, True), (plain, False)):
