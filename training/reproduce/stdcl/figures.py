@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from coloc_env.bounds import Bound
 from coloc_env.render.style import MUTED
 from training import metrics
+from training.figures import log_axis
 from training.metrics import Floats
 from training.reproduce.cost import Cost
 from training.reproduce.drawing import panels
@@ -20,6 +21,7 @@ from training.reproduce.stdcl.measures import Runs, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT
 from training.reproduce.stdcl.tables import exponent, medians, spread
 from training.reproduce.verdicts import interval
+from training.results import short
 
 Bounds = Mapping[str, Bound | None]
 _BOTH = ("mds", plan.WHOLE)  # whom figures 4 and 5 compare
@@ -47,7 +49,7 @@ def layouts(found: Mapping[str, Teams]) -> Figure:
             for start, end in zip(truth[scored, :2], found_at[scored, :2], strict=True):
                 axes.plot(*np.transpose((start, end)), color=colour, linewidth=0.8)
             _dots(axes, found_at[scored], s=7, color=colour, zorder=3)
-            axes.set_title(f"{name(agent)}, {title}: {one.whole:.3g} m", fontsize=9.5)
+            axes.set_title(f"{name(agent)}, {title}: {short(one.whole)} m", fontsize=9.5)
             _frame(axes, truth[:, :2])
     return figure
 
@@ -94,6 +96,7 @@ def over_time(found: Mapping[float, Teams], bounds: Mapping[float, Bounds]) -> F
         in_time(axes, there, bounds[v_max])
         axes.set_title(f"v_max = {v_max:g} m/s")
     grid[0].set_ylabel("NRMSE")
+    metres(grid[-1], next((x.radius for x in there.values()), np.nan))
     legend(figure, grid)
     return figure
 
@@ -148,7 +151,7 @@ def radii(found: Mapping[float, Teams], bounds: Mapping[float, Bounds]) -> Figur
 
 def times(grown: Mapping[int, Mapping[str, Cost]], at: Mapping[str, Cost], there: Teams) -> Figure:
     """Figure 9: median time of a whole team's step on one thread, by number of UAVs (in brackets
-    the exponent of its growth from N = 100 on), and the error that it buys with N = 200."""
+    the exponent of its growth from N = 100 on), and the error that it buys (hollow: Huber)."""
     figure, ((growth, trade),) = panels(1, 2, (12.0, 4.6), "Time of a step")
     agents = dict.fromkeys(agent for cost in grown.values() for agent in cost)
     for i, agent in enumerate(agents):
@@ -160,15 +163,15 @@ def times(grown: Mapping[int, Mapping[str, Cost]], at: Mapping[str, Cost], there
     growth.set(xlabel="UAVs", ylabel="median time (ms)", xscale="log", yscale="log")
     growth.set_xticks(list(grown), [str(n) for n in grown])
     growth.minorticks_off()
-    growth.legend(fontsize=8)
+    legend(figure, [growth])
     for i, agent in enumerate(a for a in at if a in there):
-        style = look(agent, i)
+        colour, dashed = look(agent, i)["color"], agent == plan.HUBER
+        face = "none" if dashed else colour
         x, y = float(np.median(at[agent].ms)), there[agent].whole
-        trade.plot(x, y, "o", color=style["color"], markersize=7)
-        trade.annotate(style["label"], (x, y), (6, 4), textcoords="offset points", fontsize=8)
-    trade.set(xlabel="median time (ms)", ylabel="RMSE (m)", xscale="log", title="N = 200")
-    trade.margins(x=0.25)
-    log(trade)
+        trade.plot(x, y, "o", color=colour, markerfacecolor=face, markersize=8)
+    trade.set(xlabel="median time (ms)", ylabel="RMSE (m)", title="N = 200, v_max = 10 m/s")
+    log_axis(trade.xaxis, trade.set_xscale)
+    log_axis(trade.yaxis, trade.set_yscale)
     return figure
 
 
@@ -186,7 +189,7 @@ def curve(axes: Axes, agent: str, index: int, found: Mapping[float, Runs], scale
 
 
 def in_time(axes: Axes, there: Teams, bounds: Bounds) -> None:
-    """NRMSE over time with its bounds, and a scale in m."""
+    """NRMSE over time with its bounds."""
     reach = dt = float("nan")
     for i, (agent, one) in enumerate(there.items()):
         reach, dt = one.radius, one.results.dt
@@ -199,7 +202,6 @@ def in_time(axes: Axes, there: Teams, bounds: Bounds) -> None:
             axes.plot(seconds(height, dt), height, **style)
     axes.set(xlabel="time (s)")
     log(axes)
-    metres(axes, reach)
 
 
 def seconds(values: Floats, dt: float) -> Floats:

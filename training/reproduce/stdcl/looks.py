@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from training.figures import BOUND, log_axis
 from training.reproduce.stdcl import plan
@@ -54,7 +55,11 @@ def legend(figure: Figure, axes: Sequence[Axes], columns: int = 5) -> None:
 
 
 def log(axes: Axes) -> None:
-    """A logarithmic height with plain numbers."""
+    """A logarithmic height with plain numbers, as high as the lines; intervals may go beyond."""
+    heights = [np.asarray(line.get_ydata(), float) for line in axes.lines]
+    known = np.concatenate([y[np.isfinite(y) & (y > 0)] for y in (*heights, np.zeros(0))])
+    if known.size:
+        axes.set_ylim(known.min() / 1.3, 1.3 * known.max())
     log_axis(axes.yaxis, axes.set_yscale)
 
 
@@ -63,6 +68,7 @@ def metres(axes: Axes, reach: float) -> None:
     if np.isfinite(reach):
         other = axes.secondary_yaxis("right", functions=(_times(reach), _times(1 / reach)))
         other.set_ylabel("RMSE (m)")
+        other.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _times(factor: float) -> Callable[[Any], Any]:

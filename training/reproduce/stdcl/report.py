@@ -75,21 +75,25 @@ def paper_part(flown: Flown, the: Plan, folder: Path) -> Text:
     text += [f"`swarm-v0`; {the.runs} runs of the main table, {the.some} of the others.", ""]
     text += section("Average NRMSE (figure 6)", tables.averages(speeds, flown, keys), 2)
     drawings: Drawings = {}
-    layouts = {n: _shown(flown.runs(the.layout(n).key)) for n in ("random", "u", "o")}
-    if any(layouts.values()):
+    layouts = {
+        name: _shown(there)
+        for name in ("random", "u", "o")
+        if (there := flown.runs(the.layout(name).key))
+    }
+    if layouts:
         drawings[FILES[0]] = partial(figures.layouts, layouts)
-    if layouts["random"]:
+    if "random" in layouts:
         drawings[FILES[1]] = partial(figures.maps, layouts["random"])
     if any(speeds.values()):
-        shown = {v: _shown(there) for v, there in speeds.items()}
+        shown = {v: _shown(there) for v, there in speeds.items() if there}
         known = {v: _bounds(flown, key) for v, key in keys.items()}
         drawings[FILES[2]] = partial(figures.over_time, shown, known)
     slow = flown.runs(the.speed(plan.SLOW).key)
     if WHOLE in slow:
         drawings[FILES[3]] = partial(figures.tracks, slow[WHOLE])
-    radii = {r: _shown(flown.runs(the.radius(r).key)) for r in plan.RADII}
-    if any(radii.values()):
-        known = {r: _bounds(flown, the.radius(r).key) for r in plan.RADII}
+    radii = {r: _shown(there) for r in plan.RADII if (there := flown.runs(the.radius(r).key))}
+    if radii:
+        known = {r: _bounds(flown, the.radius(r).key) for r in radii}
         drawings[FILES[4]] = partial(figures.radii, radii, known)
     grown = {n: c for n in plan.GROWTH if (c := flown.cost.get(the.timed(n).key))}
     at = flown.cost.get(the.timed(200).key, {})

@@ -26,8 +26,8 @@ def nlos(biased: By, heavy: By, bounds: tuple[ByBounds, ByBounds]) -> Figure:
     for axes, found, known, title in zip(grid, (biased, heavy), bounds, titles, strict=True):
         _curves(axes, found, known, 100.0, scaled=True)
         axes.set(xlabel="NLOS ranges (%)", title=title)
-        metres(axes, _reach(found))
     grid[0].set_ylabel("NRMSE")
+    metres(grid[-1], _reach(heavy))
     legend(figure, grid)
     return figure
 
@@ -51,6 +51,7 @@ def connectivity(sparse: By, known: ByBounds, failing: Teams, bounds: Bounds) ->
         by_degree.minorticks_off()
     in_time(in_steps, failing, bounds)
     in_steps.set(title="b  25 % of the links failing", ylabel="NRMSE")
+    metres(in_steps, _reach({0.0: failing}))
     legend(figure, [by_degree, in_steps])
     return figure
 
