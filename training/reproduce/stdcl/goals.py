@@ -79,7 +79,7 @@ def goals(the: Plan) -> Iterator[Goal]:
         ((the.long().key, WHOLE),),
         lambda x: interval(x.drift()),
     )
-    ten = the.flight("s2").key
+    ten = the.timed_flight().key
     for key, agent, limit in (
         (the.timed(200).key, OPTIMIZER, 20.0),
         (the.timed(200).key, WHOLE, 40.0),

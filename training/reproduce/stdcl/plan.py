@@ -214,6 +214,11 @@ class Plan:
             bounded=False,
         )
 
+    def timed_flight(self) -> Variant:
+        """Where steps of ten UAVs are timed."""
+        overrides = (("flight", "s2"), ("horizon", 100))
+        return Variant("time-campus", "ten UAVs", overrides, "campus-v0", self.steps)
+
     # ---------------------------------------------------------------- scenes
 
     def paper(self) -> list[Scene]:

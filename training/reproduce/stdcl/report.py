@@ -178,7 +178,7 @@ def campus_part(flown: Flown, the: Plan, folder: Path) -> Text:
         drawings[FILES[12]] = partial(loop_figures.link, flown.watched, event)
     text = ["## Flights over a campus, simulated", ""]
     text += section("Table 2: formation geometry and trajectories", tables.flights(found), 2)
-    at = flown.cost.get(the.flight("s2").key, {})
+    at = flown.cost.get(the.timed_flight().key, {})
     text += section("Table 1: time of a step, ten UAVs", tables.costs(at), 1)
     text += [
         "The paper's Jetson Nano (45 ms for ST-DCL) is not at hand; this machine's is above.",

@@ -85,7 +85,7 @@ def _timed(the: Plan, parts: Sequence[str]) -> list[tuple[Variant, tuple[str, ..
             dear = REFERENCES if n <= plan.JOINT_UP_TO else ()
             found.append((the.timed(n), (*METHODS, *dear)))
     if "campus" in parts:
-        found.append((the.flight("s2"), (*METHODS, *REFERENCES)))
+        found.append((the.timed_flight(), (*METHODS, *REFERENCES)))
     return found
 
 
