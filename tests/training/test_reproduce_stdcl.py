@@ -1,5 +1,6 @@
 """``coloc reproduce stdcl``: its plan, figures of merit, verdicts on made-up runs, a report."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,9 @@ def watched_link() -> tuple[Watched, Event]:
     measured[90:, 1, :] = measured[90:, :, 1] = np.nan
     error = np.ones((100, 3))
     error[70, 2], error[70, 1] = 5.0, 9.0
-    return Watched(error, length, measured, weight, 0.1), Event(0, 2, 60, 80)
+    blocked = np.zeros((100, 3, 3), bool)
+    blocked[60:81, 0, 2] = blocked[60:81, 2, 0] = True
+    return Watched(error, length, blocked, measured, weight, 0.1), Event(0, 2, 60, 80)
 
 
 def test_the_event_of_a_link() -> None:
@@ -178,10 +181,22 @@ def test_the_event_of_a_link() -> None:
 
 def test_a_link_that_is_never_cut_off() -> None:
     watched, event = watched_link()
-    whole = Watched(watched.error, watched.length, watched.range, np.ones((100, 3, 3)), 0.1)
+    whole = replace(watched, weight=np.ones((100, 3, 3)))
     assert whole.fall(event) == np.inf
-    clean = Watched(watched.error, watched.length, watched.length, watched.weight, 0.1)
-    assert clean.event() is None
+
+
+@pytest.mark.parametrize("why", ["in sight", "nothing measured", "between anchors", "no start"])
+def test_what_is_no_event(why: str) -> None:
+    watched, _ = watched_link()
+    if why == "in sight":
+        watched = replace(watched, blocked=np.zeros((100, 3, 3), bool))
+    elif why == "nothing measured":
+        watched.range[60:81] = np.nan
+    elif why == "between anchors":
+        watched.error[:, [0, 2]] = np.nan
+    else:
+        watched.range[:60] = np.nan
+    assert watched.event() is None
 
 
 def test_weights_are_those_of_the_step(tmp_path: Path) -> None:
@@ -212,8 +227,7 @@ class Told(Flown):
         whole, _ = watched_link()
         fast = whole.weight.copy()
         fast[60:81, 0, 2] = fast[60:81, 2, 0] = 0.1
-        quick = Watched(whole.error, whole.length, whole.range, fast, 0.1)
-        poor = Watched(3 * whole.error, whole.length, whole.range, whole.weight, 0.1)
+        quick, poor = replace(whole, weight=fast), replace(whole, error=3 * whole.error)
         both = {WHOLE: quick, f"{OPTIMIZER}:confidence=none": poor}
         super().__init__(None, {}, {}, both, None)  # type: ignore[arg-type]
         object.__setattr__(self, "told", told)

@@ -41,9 +41,7 @@ def layouts(found: Mapping[str, Teams]) -> Figure:
             one = there[agent]
             truth, scored = one.results.truth[0, -1] / 1e3, one.scored[0, -1]
             found_at = truth + one.one.offset[0, -1] / 1e3
-            axes.scatter(
-                *truth[scored, :2].T, s=26, facecolors="none", edgecolors="#aaaaaa", lw=0.8
-            )
+            _dots(axes, truth[scored], s=26, facecolors="none", edgecolors="#aaaaaa", lw=0.8)
             _dots(axes, truth[~scored], s=16, marker="^", color=MUTED)
             colour = look(agent)["color"]
             for start, end in zip(truth[scored, :2], found_at[scored, :2], strict=True):

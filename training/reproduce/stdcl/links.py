@@ -15,26 +15,28 @@ from torch import Tensor
 
 from agents.localizer import Localizer, make
 from agents.swarm.filter import SwarmFilter
+from coloc_env.walls import depth
 from coloc_env.world import World
 from training.evaluate import Progress
-from training.metrics import Floats
+from training.metrics import Flags, Floats
 from training.reproduce.identity import code_of
 from training.reproduce.store import Arrays, Store
 from training.reproduce.study import Piece, Variant
 
-NLOS = 1.0  # m beyond the truth: a range so much too long has not come straight
 LOW = 0.2  # weight below which the paper calls a link cut off
 _APART = 5.0  # s without NLOS that end an event
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """A run of K steps of N UAVs: ``error`` [K, N] m; between all pairs [K, N, N] the true
-    ``length`` m, the ``range`` m (NaN: none), and the ``weight`` of the link as a multiple of that
-    of a range with the believed noise; ``dt`` s."""
+    """A run of K steps of N UAVs: ``error`` [K, N] m, NaN of anchors; between all pairs [K, N, N]
+    the true ``length`` m, whether a wall is between (``blocked``), the ``range`` m (NaN: none), and
+    the ``weight`` of the link as a multiple of that of a range with the believed noise; ``dt`` s.
+    """
 
     error: Floats
     length: Floats
+    blocked: Flags
     range: Floats
     weight: Floats
     dt: float
@@ -46,14 +48,15 @@ class Watched:
         return np.array([connected_components(each, directed=False)[0] for each in linked])
 
     def event(self) -> "Event | None":
-        """The longest time over which some link stayed NLOS and measured, after a clean one."""
-        excess = self.range - self.length
-        known = np.isfinite(excess)
-        late, apart = np.where(known, excess, 0.0) > NLOS, max(1, round(_APART / self.dt))
+        """Of all times that a wall came between two UAVs which had measured each other before, that
+        with the most ranges; None if there is none. Links between anchors do not count."""
+        known, apart = np.isfinite(self.range), max(1, round(_APART / self.dt))
+        anchor = np.isnan(self.error).all(0)
         best, count = None, 0
-        n = self.error.shape[1]
-        for i, j in zip(*np.triu_indices(n, 1), strict=True):
-            steps = np.flatnonzero(late[:, i, j])
+        for i, j in zip(*np.triu_indices(len(anchor), 1), strict=True):
+            steps = np.flatnonzero(
+                known[:, i, j] & self.blocked[:, i, j] & ~(anchor[i] & anchor[j])
+            )
             for part in np.split(steps, np.flatnonzero(np.diff(steps) > apart) + 1):
                 if len(part) <= count:
                     continue
@@ -73,7 +76,7 @@ class Watched:
     def peak(self, event: "Event") -> float:
         """Largest error (m) of an event's UAVs from its first range to 5 s after its last."""
         last = event.last + max(1, round(_APART / self.dt))
-        return float(self.error[event.first : last + 1, [event.i, event.j]].max())
+        return float(np.nanmax(self.error[event.first : last + 1, [event.i, event.j]]))
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ def _fly_links(localizer: Localizer, variant: Variant, seed: int, tell: Progress
     observation = world.reset(seed)
     belief, weights = localizer.reset(observation), _Weights(localizer)
     arrays = {key: np.full((steps, n, n), np.nan) for key in ("length", "range", "weight")}
+    arrays["blocked"] = np.zeros((steps, n, n), bool)
     arrays["error"] = np.zeros((steps, n))
     for k in range(steps):
         belief, estimate = localizer.step(belief, observation)
@@ -142,11 +146,13 @@ def _fly_links(localizer: Localizer, variant: Variant, seed: int, tell: Progress
         arrays["range"][k] = np.where(there, observation["ranges"][0].numpy(), np.nan)
         truth = world.truth.position[0]
         arrays["length"][k] = torch.cdist(truth, truth).numpy()
+        arrays["blocked"][k] = depth(truth.unsqueeze(1), truth, scenario.network.walls).numpy() > 0
         arrays["weight"][k] = weights.last[:n, :n]
         arrays["error"][k] = (estimate.position[0] - truth).norm(dim=-1).numpy()
         world.advance(estimate.action())
         observation = world.observation()
         tell("links", k + 1, steps)
+    arrays["error"][:, : scenario.guides] = np.nan
     return arrays
 
 

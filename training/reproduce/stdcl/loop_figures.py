@@ -12,7 +12,7 @@ from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.figures import seconds
 from training.reproduce.stdcl.flown import Teams
 from training.reproduce.stdcl.links import LOW, Event, Loop, Watched
-from training.reproduce.stdcl.looks import legend, log, look, name
+from training.reproduce.stdcl.looks import legend, log, look
 from training.reproduce.stdcl.tables import spread
 from training.reproduce.study import WORLD
 from training.reproduce.verdicts import interval
@@ -71,9 +71,9 @@ def long_run(there: Teams, loop: Loop | None) -> Figure:
 
 
 def link(found: Mapping[str, Watched], event: Event) -> Figure:
-    """Figure 14: a link of S2 through an NLOS event (grey). (a) its true length, what was measured,
-    and its weight as a multiple of a clean range's; (b) mean error of its two UAVs; without weights
-    for comparison."""
+    """Figure 14: a link of S2 through an NLOS event (grey: its ranges come through a building).
+    (a) its true length, what was measured, and its weight as a multiple of a clean range's; (b)
+    mean error of its UAVs that are no anchors."""
     figure, grid = panels(2, 1, (9.0, 6.4), f"UAVs {event.i} and {event.j}", sharex=True)
     (upper,), (lower,) = grid
     first = next(iter(found.values()))
@@ -90,10 +90,9 @@ def link(found: Mapping[str, Watched], event: Event) -> Figure:
         style = look(agent, i) | {"linewidth": 1.3}
         measured = np.isfinite(one.range[part, event.i, event.j])
         weight = np.where(measured, one.weight[part, event.i, event.j], np.nan)
-        words = f"weight, {name(agent)}"
-        weights.plot(time, weight, marker=".", markersize=2, **(style | {"label": words}))
+        weights.plot(time, weight, marker=".", markersize=2, **style)
         error = one.error[part][:, [event.i, event.j]]
-        lower.plot(time, error.mean(1), **style)
+        lower.plot(time, np.nanmean(error, 1), **style)
     weights.axhline(LOW, color=MUTED, linewidth=0.8, linestyle=":")
     weights.set(ylabel="weight", ylim=(0, 1.6))
     weights.grid(False)
@@ -101,7 +100,7 @@ def link(found: Mapping[str, Watched], event: Event) -> Figure:
     for axes in (upper, lower):
         axes.axvspan(first.dt * event.first, first.dt * event.last, color=MUTED, alpha=0.15, lw=0)
     lower.set(xlabel="time (s)", ylabel="error (m)", title="b")
-    legend(figure, [upper, weights, lower], 4)
+    legend(figure, [upper, weights], 5)
     return figure
 
 
@@ -113,7 +112,7 @@ def parting(there: Teams, watched: Watched | None) -> Figure:
     if watched is not None:
         time = watched.dt * np.arange(len(watched.error))
         parts.step(time, watched.components, color="black", linewidth=1.0)
-        parts.set_ylim(0.5, max(2.5, watched.components.max() + 0.5))
+        parts.set_yticks(range(1, 1 + max(2, watched.components.max())))
     parts.set(ylabel="parts of the network", title="a")
     shown: Sequence[str] = [agent for agent in _PARTED if agent in there]
     for (axes,), letter, words in zip(teams, "bc", ("first", "second"), strict=True):

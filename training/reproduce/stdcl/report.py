@@ -102,7 +102,7 @@ def paper_part(flown: Flown, the: Plan, folder: Path) -> Text:
     text += drawing.draw(drawings, folder)
     others = [s for s in the.paper() if s.variant.key not in keys.values()]
     text += section("Layouts and radii", tables.errors(others, flown), 2)
-    text += section("Time of a step, N = 200", tables.costs(at), 1)
+    text += section("Time of a step, N = 200", tables.costs(at, tables.PAPER_MS), 1)
     text += section("Growth", tables.growth(grown), 1)
     machine = platform.processor() or platform.machine()
     return [*text, f"Whole team, one thread ({machine}), all methods step by step in turn.", ""]
@@ -179,7 +179,7 @@ def campus_part(flown: Flown, the: Plan, folder: Path) -> Text:
     text = ["## Flights over a campus, simulated", ""]
     text += section("Table 2: formation geometry and trajectories", tables.flights(found), 2)
     at = flown.cost.get(the.timed_flight().key, {})
-    text += section("Table 1: time of a step, ten UAVs", tables.costs(at), 1)
+    text += section("Table 1: time of a step, ten UAVs", tables.costs(at, tables.PAPER_NANO_MS), 1)
     text += [
         "The paper's Jetson Nano (45 ms for ST-DCL) is not at hand; this machine's is above.",
         "",

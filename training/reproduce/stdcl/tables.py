@@ -20,6 +20,7 @@ from training.results import short
 
 PAPER_NRMSE = {plan.FAST: 0.0077, plan.MODERATE: 0.0068}
 PAPER_MS = {"dwmds": 28.0, "stdcl": 36.0}  # N = 200, MATLAB, i7-12700K
+PAPER_NANO_MS = {"stdcl": 45.0}  # N = 10, Jetson Nano
 PAPER_FGE = {("s2", "stdcl"): 1.52, ("s2", "vmds"): 2.45, ("s2", "dwmds"): 3.01}
 GROWS_FROM = 100  # UAVs: smaller swarms cost what calls cost
 
@@ -183,13 +184,14 @@ def recorded(scenes: Sequence[Scene], flown: Flown) -> Table:
     return header, lines
 
 
-def costs(cost: Mapping[str, Cost], own: str = plan.WHOLE) -> Table:
-    """Time of a whole team's step, with the paper's."""
+def costs(cost: Mapping[str, Cost], papers: Mapping[str, float]) -> Table:
+    """Time of a whole team's step, with the paper's on another machine."""
+    own = plan.WHOLE
     header = ["agent", "median (ms)", "mean (ms)", "paper (ms)", f"times `{own}`", "memory (MiB)"]
     unit = medians(cost, own)
     lines = []
     for agent, one in cost.items():
-        middle, paper = float(np.median(one.ms)), PAPER_MS.get(agent)
+        middle, paper = float(np.median(one.ms)), papers.get(agent)
         held = (one.belief + one.working) / 2**20
         lines.append(
             [
