@@ -60,12 +60,8 @@ def confidence(found: By, bounds: ByBounds) -> Figure:
     """The optimizer with no confidence, the paper's, Huber's loss and calibrated weights: halving
     the weight of a link halves its pull, no more; a bias of one sign stays."""
     figure, ((axes,),) = panels(1, 1, (6.4, 4.4), "How much a doubtful link counts")
-    agents = [f"{plan.OPTIMIZER}:confidence={c}" for c in plan.CONFIDENCES]
-    names = {agents[-1]: plan.OPTIMIZER}
-    shown = {
-        x: {a: there[names.get(a, a)] for a in agents if names.get(a, a) in there}
-        for x, there in found.items()
-    }
+    agents = (*(f"{plan.OPTIMIZER}:confidence={c}" for c in plan.CONFIDENCES), plan.OPTIMIZER)
+    shown = {x: {a: there[a] for a in agents if a in there} for x, there in found.items()}
     _curves(axes, shown, bounds, 100.0, scaled=False)
     axes.set(xlabel="NLOS ranges (%)", ylabel="RMSE (m)")
     axes.legend(fontsize=8)
