@@ -134,8 +134,6 @@ def reproduce(
     torch.set_num_threads(1)
     wanted = None if agents is None else split_agents(agents)
     where = None if variants is None else variants.split(",")
-    if fresh:
-        shutil.rmtree(out / "store", ignore_errors=True)
     if paper is Paper.marl and (agents or steps or part is not Part.all):
         raise ValueError("marl takes no --agents, --part or --steps")
     if paper in (Paper.nnhpff, Paper.stdcl) and agents:
@@ -143,6 +141,8 @@ def reproduce(
     if part not in _PARTS[paper]:
         allowed = ", ".join(each.value for each in _PARTS[paper])
         raise ValueError(f"{paper.value} has no part {part.value!r}: {allowed} are allowed")
+    if fresh:
+        shutil.rmtree(out / "store", ignore_errors=True)
     fly, count = not report_only, runs or _RUNS[paper]
     with progress() as tell:
         if paper is Paper.marl:

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from agents import make
 from agents.localizer import LOCALIZERS
 from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
 from coloc_env.scenarios import make_scenario
+from training.cli import app
 from training.reproduce import pool
 from training.reproduce.cost import Cost
 from training.reproduce.stdcl import goals, links, plan, tables
@@ -376,3 +378,31 @@ def test_nothing_stored_nothing_told(tmp_path: Path) -> None:
 def test_unknown_variants_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown variant 'v7'"):
         reproduce(tmp_path, "paper", 2, 0, ["v7"], 6, 1, True, quiet, quiet)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def coloc(*arguments: str | Path) -> Any:
+    return CliRunner().invoke(app, ["reproduce", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("stdcl", "--part", "robustness"), "stdcl has no part 'robustness': paper, stress"),
+        (("pfnn", "--part", "campus"), "pfnn has no part 'campus': paper, robustness, all are"),
+        (("stdcl", "--agents", "map"), "stdcl takes no --agents"),
+    ],
+)
+def test_what_a_paper_does_not_have(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    done = coloc(*arguments, "--out", tmp_path / "x")
+    assert done.exit_code != 0
+    assert words in str(done.exception) + done.output
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_report_of_nothing_from_the_command_line(tmp_path: Path) -> None:
+    done = coloc("stdcl", "--part", "real", "--report-only", "--steps", 5, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert "## Recordings" in (tmp_path / "report.md").read_text()
