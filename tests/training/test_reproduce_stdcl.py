@@ -231,7 +231,7 @@ class Told(Flown):
         fast[60:81, 0, 2] = fast[60:81, 2, 0] = 0.1
         quick, poor = replace(whole, weight=fast), replace(whole, error=3 * whole.error)
         both = {WHOLE: quick, f"{OPTIMIZER}:confidence=none": poor}
-        super().__init__(None, {}, {}, both, None)  # type: ignore[arg-type]
+        super().__init__(None, {}, {}, both, None, None)  # type: ignore[arg-type]
         object.__setattr__(self, "told", told)
         object.__setattr__(self, "default", default)
 

@@ -17,12 +17,14 @@ Teams = Mapping[str, Runs]  # by agent
 @dataclass(frozen=True, eq=False)
 class Flown:
     """What a study holds: ``cost`` of steps by variant's key and agent; links of single runs
-    ``watched``, by agent; confidences of a long ``loop``."""
+    ``watched`` about a light building, by agent, and of one that is ``parted``; confidences of a
+    long ``loop``."""
 
     study: Study
     scenes: Mapping[str, Scene]
     cost: Mapping[str, Mapping[str, Cost]]
     watched: Mapping[str, Watched]
+    parted: Watched | None
     loop: Loop | None
     _kept: dict[str, dict[str, Runs]] = field(default_factory=dict)
 

@@ -71,7 +71,7 @@ def long_run(there: Teams, loop: Loop | None) -> Figure:
 
 
 def link(found: Mapping[str, Watched], event: Event) -> Figure:
-    """Figure 14: a link of S2 through an NLOS event (grey: its ranges come through a building).
+    """Figure 14: a link of S2 through an NLOS event (grey: ranges through a light building).
     (a) its true length, what was measured, and its weight as a multiple of a clean range's; (b)
     mean error of its UAVs that are no anchors."""
     figure, grid = panels(2, 1, (9.0, 6.4), f"UAVs {event.i} and {event.j}", sharex=True)

@@ -214,6 +214,13 @@ class Plan:
             bounded=False,
         )
 
+    def lighter(self) -> Variant:
+        """The second flight about a building that ranges get through for longer: 1 dB a metre."""
+        overrides = (("flight", "s2"), ("wall_loss", 1.0))
+        return Variant(
+            "campus-s2-light", "S2, a light building", overrides, "campus-v0", self.steps
+        )
+
     def timed_flight(self) -> Variant:
         """Where steps of ten UAVs are timed."""
         overrides = (("flight", "s2"), ("horizon", 100))
@@ -249,7 +256,7 @@ class Plan:
         agents = (HUBER, *ABLATION, UNFED, PAPERS_FEEDBACK, CLOSED_AFTERWARDS)
         where = [self.speed(MODERATE), *self.held_out().values()]
         found = [Scene(v, agents, self.some) for v in where]
-        return [*found, Scene(self.long(), (OPTIMIZER, WHOLE, UNFED), self.bounded)]
+        return [*found, Scene(self.long(), (OPTIMIZER, WHOLE, UNFED), self.some)]
 
     def campus(self) -> list[Scene]:
         """Section 6's flights, simulated."""

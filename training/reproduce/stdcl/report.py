@@ -172,7 +172,7 @@ def campus_part(flown: Flown, the: Plan, folder: Path) -> Text:
     drawings: Drawings = {}
     watched = flown.watched.get(WHOLE) or flown.watched.get(OPTIMIZER)
     if found["s2"]:
-        drawings[FILES[11]] = partial(loop_figures.parting, found["s2"], watched)
+        drawings[FILES[11]] = partial(loop_figures.parting, found["s2"], flown.parted)
     event = None if watched is None else watched.event()
     if event is not None:
         drawings[FILES[12]] = partial(loop_figures.link, flown.watched, event)

@@ -59,7 +59,7 @@ def reproduce(
         if where is None or variant.key in where:
             able = _able(study, variant, agents)
             cost[variant.key] = measured(study.store, variant, seed, able, tell, missing)
-    flown = _watched(Flown(study, wanted, cost, {}, None), the, tell, missing)
+    flown = _watched(Flown(study, wanted, cost, {}, None, None), the, tell, missing)
     text = ["# ST-DCL, reproduced", "", f"{plan.TITLE}.", ""]
     with staged_folder(out, NAMES) as folder:
         text += report.claims_part(flown, the, parts, folder)
@@ -98,13 +98,18 @@ def _able(study: Study, variant: Variant, agents: Sequence[str]) -> list[str]:
 def _watched(flown: Flown, the: Plan, tell: Progress, missing: bool) -> Flown:
     """With the runs in which links are looked at, where their variants are wanted."""
     study, found = flown.study, flown
-    split, long = the.flight("s2"), the.long()
+    split, light, long = the.flight("s2"), the.lighter(), the.long()
+
+    def look(variant: Variant, agent: str) -> dict[str, links.Watched]:
+        one = links.watched(study.store, variant, agent, study.seed, tell, missing)
+        return {} if one is None else {agent: one}
+
     if split.key in flown.scenes and study.can(split):
         there: dict[str, links.Watched] = {}
-        for agent in _able(study, split, _WATCHED):
-            one = links.watched(study.store, split, agent, study.seed, tell, missing)
-            there |= {} if one is None else {agent: one}
-        found = replace(found, watched=there)
+        for agent in _able(study, light, _WATCHED):
+            there |= look(light, agent)
+        parted = look(split, OPTIMIZER).get(OPTIMIZER)
+        found = replace(found, watched=there, parted=parted)
     if long.key in flown.scenes and _able(study, long, [WHOLE]):
         loop = links.loop(study.store, long, WHOLE, study.seed, tell, missing)
         found = replace(found, loop=loop)
