@@ -5,6 +5,7 @@ from coloc_env.scenarios import indoor as _indoor  # noqa: F401
 from coloc_env.scenarios import replay as _replay  # noqa: F401
 from coloc_env.scenarios import replay_anchors as _replay_anchors  # noqa: F401
 from coloc_env.scenarios import replay_team as _replay_team  # noqa: F401
+from coloc_env.scenarios import stein as _stein  # noqa: F401
 from coloc_env.scenarios import swarm as _swarm  # noqa: F401
 from coloc_env.scenarios import wsn as _wsn  # noqa: F401
 from coloc_env.scenarios.registry import (

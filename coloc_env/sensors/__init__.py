@@ -11,6 +11,8 @@ from coloc_env.sensors.odometry import Odometry
 from coloc_env.sensors.position_fix import PositionFix
 from coloc_env.sensors.range_noise import RangeNoise
 from coloc_env.sensors.ranging import AnchorRanging, Ranging
+from coloc_env.sensors.reference import Reference
+from coloc_env.sensors.relative_pose import RelativePose
 from coloc_env.sensors.slow_flight import SlowFlight
 
 __all__ = [
@@ -29,6 +31,8 @@ __all__ = [
     "RangeNoise",
     "Ranging",
     "Recorded",
+    "Reference",
+    "RelativePose",
     "Sensor",
     "SlowFlight",
     "UavBearings",

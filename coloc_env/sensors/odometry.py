@@ -1,4 +1,4 @@
-"""Wheel odometry of a ground robot in the plane."""
+"""Odometry: what a vehicle moved and turned over a step, by its wheels or by its cameras."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,11 +14,13 @@ from coloc_env.sensors.base import Layout, Leaf, Sensor, Window, require
 
 @dataclass(frozen=True)
 class Odometry(Sensor):
-    """Leaf ``odometry`` [3]: displacement forward and left (m) and turn (rad) over the step that
-    ends now, divided by dt, in the body frame at the step's start.
+    """Leaf ``odometry`` [3] or, in space, [6]: displacement forward and left, and up in space (m),
+    and turn (rad; a rotation vector in space) over the step that ends now, divided by dt, in the
+    body frame at the step's start.
 
-    The noise of one sample has standard deviations ``forward_std`` and ``left_std`` (m/s) and
-    ``turn_std`` (rad/s), each plus ``relative`` times the magnitude of what it measures.
+    The noise of one sample has standard deviations ``forward_std`` and ``left_std`` (m/s; the
+    latter upwards, too) and ``turn_std`` (rad/s), each plus ``relative`` times the magnitude of
+    what it measures.
     """
 
     forward_std: float = 0.02
@@ -31,23 +33,27 @@ class Odometry(Sensor):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        require(layout.arena.dim == 2, "Odometry", "dim", "odometry needs a 2-D scenario")
-        return {"odometry": Leaf(3)}
+        return {"odometry": Leaf(6 if layout.arena.dim == 3 else 3)}
 
     def std(self, odometry: Tensor) -> Tensor:
-        """Standard deviations [..., 3] of a sample [..., 3]; sideways slip follows the speed."""
-        base = odometry.new_tensor((self.forward_std, self.left_std, self.turn_std))
+        """Standard deviations of a sample, as wide as it is; sideways slip follows the speed."""
+        dim = 3 if odometry.shape[-1] == 6 else 2
+        turns = odometry.shape[-1] - dim
+        slips = (self.forward_std, *(self.left_std,) * (dim - 1))
+        base = odometry.new_tensor((*slips, *(self.turn_std,) * turns))
         size = odometry.abs()
-        speed = size[..., :1]
-        return base + self.relative * torch.cat((speed, speed, size[..., 2:]), -1)
+        speed = size[..., :1].expand(*size.shape[:-1], dim)
+        return base + self.relative * torch.cat((speed, size[..., dim:]), -1)
 
     def turn_rate(self, leaves: Mapping[str, Float32[Tensor, "B N F"]]) -> Float32[Tensor, "B N t"]:
-        return leaves["odometry"][..., 2:]
+        odometry = leaves["odometry"]
+        return odometry[..., 2:] if odometry.shape[-1] == 3 else odometry[..., 3:]
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         now, before, dt = window.motion, window.before, window.layout.arena.dt
         moved = unrotate(before.attitude, now.position - before.position)
         turned = rotation_between(before.attitude, now.attitude)
         clean = (torch.cat((moved, turned), -1) / dt).to(torch.float32)
-        white = noise.normal(window.keys, "odometry", 3 * clean.shape[-2]).unflatten(-1, (-1, 3))
+        n, width = clean.shape[-2:]
+        white = noise.normal(window.keys, "odometry", width * n).unflatten(-1, (n, width))
         return {"odometry": (clean + white * self.std(clean)) * window.alive.unsqueeze(-1)}

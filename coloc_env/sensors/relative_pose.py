@@ -1,0 +1,143 @@
+"""Relative poses between UAVs, as matches of what their cameras see give them: some are wrong."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.geometry import quaternion_conjugate, quaternion_product, rotate_by, unrotate
+from coloc_env.motion import Arena
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+
+
+def pose_width(dim: int) -> int:
+    """Numbers in a pose: position, and quaternion wxyz or heading."""
+    return 7 if dim == 3 else 3
+
+
+@dataclass(frozen=True)
+class RelativePose(Sensor):
+    """Leaves ``relative_poses`` [M · P], ``relative_pose_mask`` [M] and ``relative_pose_ends``
+    [M · 2]: at each step M = ``matches`` ordered pairs (i, j) of UAVs are drawn, each alike, and
+    UAVs i and j both learn the pose of j in the body frame of i: position (m), then quaternion
+    wxyz (P = 7) or heading in rad (P = 3). ``relative_pose_ends`` says i and j.
+
+    Position noise has ``std`` m per axis, rotation noise ``turn_std`` rad per body axis. With
+    probability ``outliers`` a match is wrong: it shows j at a pose drawn uniformly from the arena
+    and from all rotations. A pair whose link does not reach learns nothing.
+    """
+
+    matches: int = 1
+    std: float = 0.05
+    turn_std: float = math.radians(2.0)
+    outliers: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.matches >= 1, self, "matches", "at least one match a step")
+        for name in ("std", "turn_std"):
+            require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
+        require(0 <= self.outliers <= 1, self, "outliers", "a probability in [0, 1]")
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        arena = layout.arena
+        return {
+            "relative_poses": Leaf(self.matches * pose_width(arena.dim)),
+            "relative_pose_mask": Leaf(self.matches, *MASK),
+            "relative_pose_ends": Leaf(2 * self.matches, 0.0, float(max(1, arena.n_uavs - 1))),
+        }
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        arena = window.layout.arena
+        first, second = _pairs(window.keys, arena.n_uavs, self.matches)
+        position, attitude = self._shown(window, second, arena)
+        own, facing = _of(window.motion.position, first), _of(window.motion.attitude, first)
+        clean = torch.cat(
+            (unrotate(facing, position - own), _relative(facing, attitude)), -1
+        ).to(torch.float32)
+        pose = self._noisy(clean, window.keys, arena.dim)
+        held = _held(window, first, second)
+        ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
+        return {
+            "relative_poses": (pose.unsqueeze(2) * held.unsqueeze(-1)).flatten(-2),
+            "relative_pose_mask": held.to(torch.float32),
+            "relative_pose_ends": ends.flatten(-2).to(torch.float32),
+        }
+
+    def _shown(
+        self, window: Window, second: Int64[Tensor, "R K M"], arena: Arena
+    ) -> tuple[Float64[Tensor, "R K M d"], Float64[Tensor, "R K M a"]]:
+        """Where each match shows its second UAV: where it is or, if the match is wrong, anywhere."""
+        m, low = self.matches, window.motion.position.new_tensor(arena.low)
+        drawn = noise.uniform(window.keys, "relative_pose.outlier", m * (1 + arena.dim)).double()
+        wrong, place = drawn.unflatten(-1, (m, -1)).split((1, arena.dim), -1)
+        place = low + (low.new_tensor(arena.high) - low) * place
+        missed = wrong < self.outliers
+        position = torch.where(missed, place, _of(window.motion.position, second))
+        turned = _uniform_attitudes(window.keys, m, arena.dim)
+        return position, torch.where(missed, turned, _of(window.motion.attitude, second))
+
+    def _noisy(
+        self, clean: Float32[Tensor, "R K M P"], keys: Int64[Tensor, "R K"], dim: int
+    ) -> Float32[Tensor, "R K M P"]:
+        """T exp(noise): isotropic, so the same in either body frame."""
+        turns = 3 if dim == 3 else 1
+        white = noise.normal(keys, "relative_pose", self.matches * (dim + turns))
+        shift, turn = white.unflatten(-1, (self.matches, -1)).split((dim, turns), -1)
+        position = clean[..., :dim] + self.std * shift
+        return torch.cat((position, rotate_by(clean[..., dim:], self.turn_std * turn)), -1)
+
+
+def _pairs(
+    keys: Int64[Tensor, "R K"], n: int, matches: int
+) -> tuple[Int64[Tensor, "R K M"], Int64[Tensor, "R K M"]]:
+    """Ordered pairs of different UAVs, each as likely as any other; (0, 0) where there is but one
+    UAV."""
+    drawn = noise.uniform(keys, "relative_pose.pair", 2 * matches).unflatten(-1, (matches, 2))
+    first = (drawn[..., 0] * n).to(torch.int64).clamp(max=n - 1)
+    further = (drawn[..., 1] * (n - 1)).to(torch.int64).clamp(max=max(0, n - 2))
+    return first, (first + 1 + further) % n
+
+
+def _of(
+    values: Float64[Tensor, "R K N x"], index: Int64[Tensor, "R K M"]
+) -> Float64[Tensor, "R K M x"]:
+    """The values of the UAVs named."""
+    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, values.shape[-1]))
+
+
+def _relative(
+    start: Float64[Tensor, "*s a"], end: Float64[Tensor, "*s a"]
+) -> Float64[Tensor, "*s a"]:
+    """The attitude ``end`` in the body frame of ``start``; quaternions with w ≥ 0."""
+    if start.shape[-1] == 1:
+        return rotate_by(end, -start)
+    between = quaternion_product(quaternion_conjugate(start), end)
+    return torch.where(between[..., :1] < 0, -between, between)
+
+
+def _uniform_attitudes(
+    keys: Int64[Tensor, "R K"], count: int, dim: int
+) -> Float64[Tensor, "R K M a"]:
+    """Attitudes uniform over all rotations: headings, or directions of Gaussian vectors in R⁴."""
+    if dim == 2:
+        share = noise.uniform(keys, "relative_pose.turned", count).double().unsqueeze(-1)
+        return torch.pi * (2 * share - 1)
+    drawn = noise.normal(keys, "relative_pose.turned", 4 * count).double().unflatten(-1, (-1, 4))
+    w, x, y, z = drawn.unbind(-1)
+    return drawn / (w * w + x * x + y * y + z * z).sqrt().unsqueeze(-1)
+
+
+def _held(
+    window: Window, first: Int64[Tensor, "R K M"], second: Int64[Tensor, "R K M"]
+) -> Bool[Tensor, "R K N M"]:
+    """Which UAVs hold which matches: both ends, if their link reaches."""
+    slots = window.reach.shape[-1]
+    rows = first.unsqueeze(-1).expand(-1, -1, -1, slots)
+    reach = window.reach.gather(2, rows)
+    neighbours = window.neighbours.expand_as(window.reach).gather(2, rows)
+    linked = (reach & (neighbours == second.unsqueeze(-1))).any(-1).unsqueeze(2)
+    uav = torch.arange(window.layout.arena.n_uavs, device=first.device).unsqueeze(-1)
+    return linked & ((first.unsqueeze(2) == uav) | (second.unsqueeze(2) == uav))
