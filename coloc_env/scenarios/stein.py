@@ -120,9 +120,7 @@ def _motion(name: str, arena: Arena) -> Motion:
     if name in MOTIONS:
         return MOTIONS[name]
     if name != "static":
-        raise ValueError(
-            f"motion={name!r} is not allowed: one of static, {', '.join(MOTIONS)}"
-        )
+        raise ValueError(f"motion={name!r} is not allowed: one of static, {', '.join(MOTIONS)}")
     places = sorted(product(_LATTICE, repeat=arena.dim), key=_far)
     if arena.n_uavs > len(places) or _SPACING * max(_LATTICE) > max(arena.high):
         raise ValueError(

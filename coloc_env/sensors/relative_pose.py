@@ -54,9 +54,9 @@ class RelativePose(Sensor):
         first, second = _pairs(window.keys, arena.n_uavs, self.matches)
         position, attitude = self._shown(window, second, arena)
         own, facing = _of(window.motion.position, first), _of(window.motion.attitude, first)
-        clean = torch.cat(
-            (unrotate(facing, position - own), _relative(facing, attitude)), -1
-        ).to(torch.float32)
+        clean = torch.cat((unrotate(facing, position - own), _relative(facing, attitude)), -1).to(
+            torch.float32
+        )
         pose = self._noisy(clean, window.keys, arena.dim)
         held = _held(window, first, second)
         ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
@@ -69,7 +69,7 @@ class RelativePose(Sensor):
     def _shown(
         self, window: Window, second: Int64[Tensor, "R K M"], arena: Arena
     ) -> tuple[Float64[Tensor, "R K M d"], Float64[Tensor, "R K M a"]]:
-        """Where each match shows its second UAV: where it is or, if the match is wrong, anywhere."""
+        """Where each match shows its second UAV: where it is or, if it is wrong, anywhere."""
         m, low = self.matches, window.motion.position.new_tensor(arena.low)
         drawn = noise.uniform(window.keys, "relative_pose.outlier", m * (1 + arena.dim)).double()
         wrong, place = drawn.unflatten(-1, (m, -1)).split((1, arena.dim), -1)

@@ -1,0 +1,124 @@
+"""The matches that a holder remembers: ring buffers that move along with the team."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.tensorclasses import build
+from coloc_env.geometry import Poses
+from coloc_env.observation import Observation
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What holders are told in a step: the pose of UAV ``second`` in the frame of UAV ``first``,
+    and which of the C entries are there."""
+
+    first: Int64[Tensor, "B H C"]
+    second: Int64[Tensor, "B H C"]
+    pose: Float64[Tensor, "B H C P"]
+    told: Bool[Tensor, "B H C"]
+
+
+class Window(TensorClass):
+    """The last W matches of each holder, moved along to the present; batch (B, H).
+
+    ``spread``: by how much their variance has grown since they were measured (1: not at all).
+    ``cursor``: where the next one goes.
+    """
+
+    first: Int64[Tensor, "B H W"]
+    second: Int64[Tensor, "B H W"]
+    pose: Float64[Tensor, "B H W P"]
+    spread: Float64[Tensor, "B H W"]
+    held: Bool[Tensor, "B H W"]
+    cursor: Int64[Tensor, "B H"]
+
+
+def empty(poses: type[Poses], shape: torch.Size, size: int, like: Tensor) -> Window:
+    """Nothing remembered, in ``size`` slots."""
+    index = torch.zeros(*shape, size, dtype=torch.int64, device=like.device)
+    return build(
+        Window,
+        shape,
+        first=index,
+        second=index,
+        pose=poses.identity(like).expand(*shape, size, -1).clone(),
+        spread=torch.ones_like(index, dtype=like.dtype),
+        held=torch.zeros_like(index, dtype=torch.bool),
+        cursor=index[..., 0],
+    )
+
+
+def matches(
+    poses: type[Poses], observation: Observation, heard: Bool[Tensor, "B H N"], everyone: bool
+) -> Matches:
+    """The matches that holders are ends of or, with ``everyone``, those of all they hear as well
+    (each told by its first end, or known as the second)."""
+    told = observation["relative_pose_mask"] > 0
+    slots = told.shape[-1]
+    ends = torch.where(told, 1.0, 0.0).unsqueeze(-1) * observation["relative_pose_ends"].unflatten(
+        -1, (slots, 2)
+    )
+    pose = observation["relative_poses"].unflatten(-1, (slots, poses.size)).double()
+    told = told & pose.isfinite().all(-1)
+    pose = torch.where(told.unsqueeze(-1), pose, poses.identity(pose))
+    first, second = ends.nan_to_num().to(torch.int64).unbind(-1)
+    if not everyone:
+        return Matches(first, second, pose, told)
+    n = told.shape[1]
+    own = torch.eye(n, dtype=torch.bool, device=told.device)
+    teller = torch.arange(n, device=told.device).unsqueeze(-1)
+    as_first = told & (first == teller)
+    passed = torch.where(own.unsqueeze(-1), told.unsqueeze(1), as_first.unsqueeze(1))
+    passed = passed & (heard | own).unsqueeze(-1)
+
+    def spread(values: Tensor) -> Tensor:
+        return values.unsqueeze(1).expand(-1, n, *values.shape[1:]).flatten(2, 3)
+
+    return Matches(spread(first), spread(second), spread(pose), passed.flatten(2))
+
+
+def moved(
+    poses: type[Poses], window: Window, step: Float64[Tensor, "B H N P"], growth: float
+) -> Window:
+    """T ← D_i⁻¹ T D_j with what each agent moved, and the variance grown by ``growth``."""
+    here, there = agents_of(step, window.first), agents_of(step, window.second)
+    pose = poses.between(here, poses.compose(window.pose, there))
+    return window.replace(pose=pose, spread=window.spread + growth)
+
+
+def stored(window: Window, new: Matches) -> Window:
+    """The window with what is new in place of what is oldest."""
+    size = window.held.shape[-1]
+    count = new.told.to(torch.int64).cumsum(-1)
+    slot = torch.where(new.told, (window.cursor.unsqueeze(-1) + count - 1) % size, size)
+
+    def put(old: Tensor, values: Tensor) -> Tensor:
+        rest = (1,) * (old.dim() - 3)
+        index = slot.reshape(*slot.shape, *rest).expand(*slot.shape, *old.shape[3:])
+        spare = torch.cat((old, old[:, :, :1]), 2)
+        return spare.scatter(2, index, values)[:, :, :size]
+
+    return build(
+        Window,
+        window.cursor.shape,
+        first=put(window.first, new.first),
+        second=put(window.second, new.second),
+        pose=put(window.pose, new.pose),
+        spread=put(window.spread, torch.ones_like(new.pose[..., 0])),
+        held=put(window.held, new.told),
+        cursor=(window.cursor + count[..., -1]) % size,
+    )
+
+
+def agents_of(
+    values: Float64[Tensor, "B H N *x"], index: Int64[Tensor, "B H W"]
+) -> Float64[Tensor, "B H W *x"]:
+    """What belongs to the agents named."""
+    rest = values.shape[3:]
+    wide = index.reshape(*index.shape, *(1,) * len(rest)).expand(*index.shape, *rest)
+    return values.gather(2, wide)
