@@ -1,6 +1,7 @@
 """Localizers and policies; importing this package registers every localizer."""
 
 from agents import costa_mds as _costa_mds  # noqa: F401
+from agents import cspf as _cspf  # noqa: F401
 from agents import dwmds as _dwmds  # noqa: F401
 from agents import ekf as _ekf  # noqa: F401
 from agents import ekf_joint as _ekf_joint  # noqa: F401

@@ -21,13 +21,26 @@ class Scale:
 
 @dataclass(frozen=True)
 class Fit:
-    """``steps``: Σ (ω/v) · Gauss–Newton step of each factor at each agent, ``weight``: Σ ω/v,
-    ``log_density`` up to a constant, ``inliers``: each match's responsibility ω."""
+    """``steps``: weighted sum of the factors' Gauss–Newton steps at each agent, ``weight`` the sum
+    of weights (of position and turn, in units of the scale's information), ``log_density`` up to a
+    constant, ``inliers``: each match's responsibility ω."""
 
     steps: Float64[Tensor, "B H N m D"]
-    weight: Float64[Tensor, "B H N m"]
+    weight: Float64[Tensor, "B H N m 2"]
     log_density: Float64[Tensor, "B H m"]
     inliers: Float64[Tensor, "B H W m"]
+
+
+@dataclass(frozen=True)
+class Factors:
+    """The window as factors, prepared once a step: who is at their ends (0 or 1), variances over
+    those of the scale (position, turn), and the weights of their steps at either end."""
+
+    at_first: Float64[Tensor, "B H N W"]
+    at_second: Float64[Tensor, "B H N W"]
+    variance: Float64[Tensor, "B H W 2"]
+    first: Float64[Tensor, "B H W 2"]
+    second: Float64[Tensor, "B H W 2"]
 
 
 def outlier_level(
@@ -40,10 +53,31 @@ def outlier_level(
     return share / (1 - share) * peak / volume
 
 
+def factors(poses: type[Poses], window: Window, scale: Scale, agents: int) -> Factors:
+    """Who is where, and how much each end's step counts.
+
+    The second end's step says where it is in the first one's frame; the first end's says where
+    it must stand to see the second there, and is by |t| times the turn's error worse.
+    """
+    one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2)
+    variance = 1 + window.grown / one
+    position, turn = variance.unbind(-1)
+    lever = poses.split(window.pose)[0].square().sum(-1) * one[..., 1] / one[..., 0]
+    index = torch.arange(agents, device=position.device).unsqueeze(-1)
+    return Factors(
+        at_first=(window.first.unsqueeze(-2) == index).to(position.dtype),
+        at_second=(window.second.unsqueeze(-2) == index).to(position.dtype),
+        variance=variance,
+        first=torch.stack((1 / (position + lever * turn), 1 / turn), -1),
+        second=1 / variance,
+    )
+
+
 def fit(
     poses: type[Poses],
     x: Float64[Tensor, "B H N m P"],
     window: Window,
+    known: Factors,
     scale: Scale,
     beta: Float64[Tensor, "B H"],
 ) -> Fit:
@@ -53,24 +87,25 @@ def fit(
     Because J_r(r) r = r, the Gauss–Newton step of one factor needs no solve: it is −r at x_j and
     Ad(T) r at x_i (eq. 17).
     """
+    d = poses.dim
     pose = window.pose.unsqueeze(-2)
     between = poses.between(agents_of(x, window.first), agents_of(x, window.second))
     residual = poses.minus(between, pose)
     squares = residual.square()
-    variance = window.spread.unsqueeze(-1)
-    one = scale.position.square()[..., None, None], scale.turn.square()[..., None, None]
-    distance = squares[..., : poses.dim].sum(-1) / one[0] + squares[..., poses.dim :].sum(-1) / one[1]
-    gauss = torch.exp(-0.5 * distance / variance)
+    one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2) * known.variance
+    distance = squares[..., :d].sum(-1) / one[..., :1] + squares[..., d:].sum(-1) / one[..., 1:]
+    gauss = torch.exp(-0.5 * distance)
     mixed = gauss + beta[..., None, None]
     held = window.held.unsqueeze(-1)
     inliers = torch.where(held, gauss / mixed, 0.0)
-    weight = inliers / variance
-    weighted = weight.unsqueeze(-1) * residual
-    m, n = x.shape[3], x.shape[2]
-    agents = torch.arange(n, device=x.device)
-    at_first = (window.first.unsqueeze(-2) == agents.unsqueeze(-1)).to(x.dtype)
-    at_second = (window.second.unsqueeze(-2) == agents.unsqueeze(-1)).to(x.dtype)
+    weighted = inliers.unsqueeze(-1) * residual
     back = poses.carry(pose, weighted)
-    steps = at_first @ back.flatten(-2) - at_second @ weighted.flatten(-2)
+    weight, steps = [], []
+    for part, cut in enumerate((slice(None, d), slice(d, None))):
+        first = known.at_first * known.first[..., part].unsqueeze(-2)
+        second = known.at_second * known.second[..., part].unsqueeze(-2)
+        weight.append((first + second) @ inliers)
+        moved = first @ back[..., cut].flatten(-2) - second @ weighted[..., cut].flatten(-2)
+        steps.append(moved.unflatten(-1, (x.shape[3], -1)))
     log_density = torch.where(held, mixed.log(), 0.0).sum(-2)
-    return Fit(steps.unflatten(-1, (m, -1)), (at_first + at_second) @ weight, log_density, inliers)
+    return Fit(torch.cat(steps, -1), torch.stack(weight, -1), log_density, inliers)

@@ -26,14 +26,14 @@ class Matches:
 class Window(TensorClass):
     """The last W matches of each holder, moved along to the present; batch (B, H).
 
-    ``spread``: by how much their variance has grown since they were measured (1: not at all).
+    ``grown``: variance that odometry has added since they were measured (position m², turn rad²).
     ``cursor``: where the next one goes.
     """
 
     first: Int64[Tensor, "B H W"]
     second: Int64[Tensor, "B H W"]
     pose: Float64[Tensor, "B H W P"]
-    spread: Float64[Tensor, "B H W"]
+    grown: Float64[Tensor, "B H W 2"]
     held: Bool[Tensor, "B H W"]
     cursor: Int64[Tensor, "B H"]
 
@@ -47,7 +47,7 @@ def empty(poses: type[Poses], shape: torch.Size, size: int, like: Tensor) -> Win
         first=index,
         second=index,
         pose=poses.identity(like).expand(*shape, size, -1).clone(),
-        spread=torch.ones_like(index, dtype=like.dtype),
+        grown=like.new_zeros(*shape, size, 2),
         held=torch.zeros_like(index, dtype=torch.bool),
         cursor=index[..., 0],
     )
@@ -83,12 +83,19 @@ def matches(
 
 
 def moved(
-    poses: type[Poses], window: Window, step: Float64[Tensor, "B H N P"], growth: float
+    poses: type[Poses],
+    window: Window,
+    step: Float64[Tensor, "B H N P"],
+    std: tuple[float, float],
 ) -> Window:
-    """T ← D_i⁻¹ T D_j with what each agent moved, and the variance grown by ``growth``."""
+    """T ← D_i⁻¹ T D_j with what each agent moved. Odometry of ``std`` (m, rad) a step adds its
+    variance at both ends, and turns what the first end sees at a distance |t|."""
     here, there = agents_of(step, window.first), agents_of(step, window.second)
     pose = poses.between(here, poses.compose(window.pose, there))
-    return window.replace(pose=pose, spread=window.spread + growth)
+    lever = poses.split(pose)[0].square().sum(-1)
+    turn = torch.full_like(lever, 2 * std[1] ** 2)
+    added = torch.stack((2 * std[0] ** 2 + lever * std[1] ** 2, turn), -1)
+    return window.replace(pose=pose, grown=window.grown + added)
 
 
 def stored(window: Window, new: Matches) -> Window:
@@ -109,7 +116,7 @@ def stored(window: Window, new: Matches) -> Window:
         first=put(window.first, new.first),
         second=put(window.second, new.second),
         pose=put(window.pose, new.pose),
-        spread=put(window.spread, torch.ones_like(new.pose[..., 0])),
+        grown=put(window.grown, torch.zeros_like(new.pose[..., :2])),
         held=put(window.held, new.told),
         cursor=(window.cursor + count[..., -1]) % size,
     )

@@ -24,6 +24,12 @@ from coloc_env.geometry.rotations import (
 from coloc_env.geometry.se2 import Se2
 from coloc_env.geometry.se3 import Se3
 
+
+def poses_in(dim: int) -> type[Poses]:
+    """Poses in the plane or in space."""
+    return Se3 if dim == 3 else Se2
+
+
 __all__ = [
     "Poses",
     "Se2",
@@ -35,6 +41,7 @@ __all__ = [
     "pair_differences",
     "pair_distances",
     "plane_angle",
+    "poses_in",
     "quaternion_conjugate",
     "quaternion_exp",
     "quaternion_log",

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from coloc_env.geometry import poses_in
 from coloc_env.sensors.base import Layout, Leaf, Sensor, Window
-from coloc_env.sensors.relative_pose import pose_width
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Reference(Sensor):
     """
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"reference": Leaf(pose_width(layout.arena.dim))}
+        return {"reference": Leaf(poses_in(layout.arena.dim).size)}
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion = window.motion

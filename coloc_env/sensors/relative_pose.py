@@ -8,14 +8,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.geometry import quaternion_conjugate, quaternion_product, rotate_by, unrotate
+from coloc_env.geometry import poses_in, rotate_by
 from coloc_env.motion import Arena
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
-
-
-def pose_width(dim: int) -> int:
-    """Numbers in a pose: position, and quaternion wxyz or heading."""
-    return 7 if dim == 3 else 3
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class RelativePose(Sensor):
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         arena = layout.arena
         return {
-            "relative_poses": Leaf(self.matches * pose_width(arena.dim)),
+            "relative_poses": Leaf(self.matches * poses_in(arena.dim).size),
             "relative_pose_mask": Leaf(self.matches, *MASK),
             "relative_pose_ends": Leaf(2 * self.matches, 0.0, float(max(1, arena.n_uavs - 1))),
         }
@@ -52,11 +47,9 @@ class RelativePose(Sensor):
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         arena = window.layout.arena
         first, second = _pairs(window.keys, arena.n_uavs, self.matches)
-        position, attitude = self._shown(window, second, arena)
-        own, facing = _of(window.motion.position, first), _of(window.motion.attitude, first)
-        clean = torch.cat((unrotate(facing, position - own), _relative(facing, attitude)), -1).to(
-            torch.float32
-        )
+        pose = torch.cat((window.motion.position, window.motion.attitude), -1)
+        shown = self._shown(_of(pose, second), window.keys, arena)
+        clean = poses_in(arena.dim).between(_of(pose, first), shown).to(torch.float32)
         pose = self._noisy(clean, window.keys, arena.dim)
         held = _held(window, first, second)
         ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
@@ -67,17 +60,15 @@ class RelativePose(Sensor):
         }
 
     def _shown(
-        self, window: Window, second: Int64[Tensor, "R K M"], arena: Arena
-    ) -> tuple[Float64[Tensor, "R K M d"], Float64[Tensor, "R K M a"]]:
-        """Where each match shows its second UAV: where it is or, if it is wrong, anywhere."""
-        m, low = self.matches, window.motion.position.new_tensor(arena.low)
-        drawn = noise.uniform(window.keys, "relative_pose.outlier", m * (1 + arena.dim)).double()
+        self, pose: Float64[Tensor, "R K M P"], keys: Int64[Tensor, "R K"], arena: Arena
+    ) -> Float64[Tensor, "R K M P"]:
+        """What each match shows: its second UAV's pose or, if it is wrong, any."""
+        m, low = self.matches, pose.new_tensor(arena.low)
+        drawn = noise.uniform(keys, "relative_pose.outlier", m * (1 + arena.dim)).double()
         wrong, place = drawn.unflatten(-1, (m, -1)).split((1, arena.dim), -1)
         place = low + (low.new_tensor(arena.high) - low) * place
-        missed = wrong < self.outliers
-        position = torch.where(missed, place, _of(window.motion.position, second))
-        turned = _uniform_attitudes(window.keys, m, arena.dim)
-        return position, torch.where(missed, turned, _of(window.motion.attitude, second))
+        other = torch.cat((place, _uniform_attitudes(keys, m, arena.dim)), -1)
+        return torch.where(wrong < self.outliers, other, pose)
 
     def _noisy(
         self, clean: Float32[Tensor, "R K M P"], keys: Int64[Tensor, "R K"], dim: int
@@ -87,7 +78,10 @@ class RelativePose(Sensor):
         white = noise.normal(keys, "relative_pose", self.matches * (dim + turns))
         shift, turn = white.unflatten(-1, (self.matches, -1)).split((dim, turns), -1)
         position = clean[..., :dim] + self.std * shift
-        return torch.cat((position, rotate_by(clean[..., dim:], self.turn_std * turn)), -1)
+        attitude = rotate_by(clean[..., dim:], self.turn_std * turn)
+        if dim == 3:
+            attitude = torch.where(attitude[..., :1] < 0, -attitude, attitude)
+        return torch.cat((position, attitude), -1)
 
 
 def _pairs(
@@ -106,16 +100,6 @@ def _of(
 ) -> Float64[Tensor, "R K M x"]:
     """The values of the UAVs named."""
     return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, values.shape[-1]))
-
-
-def _relative(
-    start: Float64[Tensor, "*s a"], end: Float64[Tensor, "*s a"]
-) -> Float64[Tensor, "*s a"]:
-    """The attitude ``end`` in the body frame of ``start``; quaternions with w ≥ 0."""
-    if start.shape[-1] == 1:
-        return rotate_by(end, -start)
-    between = quaternion_product(quaternion_conjugate(start), end)
-    return torch.where(between[..., :1] < 0, -between, between)
 
 
 def _uniform_attitudes(

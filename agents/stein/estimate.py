@@ -1,0 +1,56 @@
+"""What a holder says: the mean around its best particle, and how well its window determines it."""
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from agents.stein.likelihood import Factors, Scale
+from agents.stein.window import Window, agents_of
+from coloc_env.geometry import Poses
+
+
+def map_estimate(
+    poses: type[Poses],
+    x: Float64[Tensor, "B H N m P"],
+    log_density: Float64[Tensor, "B H m"],
+    k: Float64[Tensor, "B H m m"],
+) -> Float64[Tensor, "B H N P"]:
+    """Kernel-weighted intrinsic mean around the densest particle (Algorithm 1, line 8)."""
+    best = log_density.argmax(-1)[..., None, None]
+    weight = k.gather(2, best.expand(-1, -1, -1, k.shape[-1]))  # [B, H, 1, m]
+    weight = weight / weight.sum(-1, keepdim=True)
+    index = best.unsqueeze(-1).expand(-1, -1, x.shape[2], 1, x.shape[-1])
+    centre = x.gather(3, index)
+    mean = (weight.unsqueeze(-1) * poses.minus(x, centre)).sum(3)
+    return poses.plus(centre[..., 0, :], mean)
+
+
+def covariance(
+    poses: type[Poses],
+    estimate: Float64[Tensor, "B H N P"],
+    window: Window,
+    inliers: Float64[Tensor, "B H W"],
+    known: Factors,
+    scale: Scale,
+    prior: Float64[Tensor, "D"],
+) -> Float64[Tensor, "B H N*D N*D"]:
+    """Inverse of the Gauss–Newton information of the window about the estimate, in its tangents;
+    ``prior``: variances of a uniform pose. UAV 0 is known."""
+    n, d = estimate.shape[2], poses.dof
+    at_first, at_second = known.at_first.mT, known.at_second.mT
+    here, there = (agents_of(estimate, index) for index in (window.first, window.second))
+    back = poses.adjoint(poses.between(there, here))  # [B, H, W, D, D]
+    eye = torch.eye(d, dtype=estimate.dtype, device=estimate.device)
+    jacobian = (
+        at_second[..., None, :, None] * eye.unsqueeze(-2)
+        - at_first[..., None, :, None] * back.unsqueeze(-2)
+    ).flatten(-2)  # [B, H, W, D, N·D]
+    turns = d - poses.dim
+    std = torch.stack((scale.position,) * poses.dim + (scale.turn,) * turns, -1).unsqueeze(2)
+    grown = known.variance.sqrt()
+    grown = torch.cat((grown[..., :1],) * poses.dim + (grown[..., 1:],) * turns, -1)
+    weight = inliers.sqrt().unsqueeze(-1) / (std * grown)
+    rows = (weight.unsqueeze(-1) * jacobian).flatten(2, 3)
+    known = (1 / prior).repeat(n)
+    known[:d] = known[:d] * 1e12
+    return torch.linalg.inv(rows.mT @ rows + torch.diag(known))
