@@ -33,9 +33,10 @@ def covariance(
     known: Factors,
     scale: Scale,
     prior: Float64[Tensor, "D"],
-) -> Float64[Tensor, "B H N*D N*D"]:
-    """Inverse of the Gauss–Newton information of the window about the estimate, in its tangents;
-    ``prior``: variances of a uniform pose. UAV 0 is known."""
+) -> Float64[Tensor, "B N D D"]:
+    """Each holder's covariance of its own pose, in its tangent: inverse of the Gauss–Newton
+    information of its window about the estimate. ``prior``: variances of a uniform pose. UAV 0 is
+    known."""
     n, d = estimate.shape[2], poses.dof
     at_first, at_second = known.at_first.mT, known.at_second.mT
     here, there = (agents_of(estimate, index) for index in (window.first, window.second))
@@ -53,4 +54,6 @@ def covariance(
     rows = (weight.unsqueeze(-1) * jacobian).flatten(2, 3)
     known = (1 / prior).repeat(n)
     known[:d] = known[:d] * 1e12
-    return torch.linalg.inv(rows.mT @ rows + torch.diag(known))
+    joint = torch.linalg.inv(rows.mT @ rows + torch.diag(known))
+    own = torch.arange(n, device=estimate.device)
+    return joint.unflatten(-1, (n, d)).unflatten(2, (n, d))[:, own, own, :, own].movedim(0, 1)

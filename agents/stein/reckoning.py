@@ -11,7 +11,6 @@ from torch import Tensor
 from agents.tensorclasses import build
 from coloc_env.geometry import Poses
 from coloc_env.observation import Observation
-from coloc_env.sensors import Odometry
 
 
 class Tracks(TensorClass):
@@ -54,12 +53,7 @@ def told(
 ) -> tuple[Tracks, Moves]:
     """The tracks after a step of ``dt`` s, and what holders learn from those that they hear
     (themselves included)."""
-    speed = observation["odometry"].double()
-    usable = speed.isfinite().all(-1, keepdim=True)
-    moved = torch.where(usable, speed, 0.0) * dt.unsqueeze(-1)
-    shift, turn = moved[..., : poses.dim], moved[..., poses.dim :]
-    turned = poses.split(poses.exp(torch.cat((torch.zeros_like(shift), turn), -1)))[1]
-    own = poses.compose(tracks.own, torch.cat((shift, turned), -1))
+    own = poses.compose(tracks.own, increments(poses, observation, dt))
     now = own.unsqueeze(1).expand_as(tracks.known)
     row = heard.unsqueeze(-1)
     age = tracks.age + (dt > 0).unsqueeze(-1)
@@ -74,11 +68,16 @@ def told(
     return after, Moves(step, torch.where(heard, age, 0))
 
 
-def deviations(
-    poses: type[Poses], odometry: Odometry, dt: float, like: Tensor
-) -> Float64[Tensor, "D"]:
-    """Standard deviations of one step's odometry as a tangent vector (m, rad)."""
-    return odometry.std(like.new_zeros(poses.dof)) * dt
+def increments(
+    poses: type[Poses], observation: Observation, dt: Float64[Tensor, "B N"]
+) -> Float64[Tensor, "B N P"]:
+    """What odometry says each UAV did in a step of ``dt`` s; nothing where it says no number."""
+    speed = observation["odometry"].double()
+    usable = speed.isfinite().all(-1, keepdim=True)
+    moved = torch.where(usable, speed, 0.0) * dt.unsqueeze(-1)
+    shift, turn = moved[..., : poses.dim], moved[..., poses.dim :]
+    turned = poses.split(poses.exp(torch.cat((torch.zeros_like(shift), turn), -1)))[1]
+    return torch.cat((shift, turned), -1)
 
 
 def carried(
