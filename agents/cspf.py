@@ -260,7 +260,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         if not self.across:
             return fit(self.poses, x, now.window, now.known, now.scale, now.beta)
         beta = torch.zeros_like(now.beta) if self.literal else now.beta
-        return fit_neighbours(self.poses, x, now.window, now.scale, beta)
+        return fit_neighbours(self.poses, x, now.window, now.scale, beta, now.talking)
 
     def _squares(
         self, tangent: Float64[Tensor, "B H R N m D"], scale: Scale

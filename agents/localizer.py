@@ -96,6 +96,11 @@ class Localizer(ABC, Generic[Belief]):
         the last observation into account."""
         raise ValueError(f"{self.name} cannot be restarted from outside")
 
+    def team(self, belief: Belief) -> Float[Tensor, "B N N P"] | None:
+        """What each UAV says of everybody's pose relative to UAV 0's (position in m, quaternion or
+        heading in rad), where a method estimates that."""
+        return None
+
     def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
         """A method's own figures at this step (particles, effective sample size, …)."""
         return {}

@@ -22,6 +22,7 @@ from coloc_env.scenario import Believed
 Robust = Literal["huber", "gnc", "none"]
 
 _HUBER = 1.345  # standard deviations beyond which Huber's loss is linear
+_TIGHT = 1e-4  # m, rad: what counts as no noise
 _INLIER = 0.99  # probability that GNC keeps a match that is right
 _CLOSE = (0.5, 0.35)  # m, rad: matches that agree, when the graph is first laid out
 
@@ -100,7 +101,8 @@ class PoseGraph(RelativeTeam[History]):
         pose = observation["relative_poses"].double().unflatten(-1, (m, poses.size))
         told = (observation["relative_pose_mask"] > 0) & pose.isfinite().all(-1)
         pose = torch.where(told.unsqueeze(-1), pose, poses.identity(pose))
-        ends = observation["relative_pose_ends"].nan_to_num().to(torch.int64).unflatten(-1, (m, 2))
+        ends = observation["relative_pose_ends"].unflatten(-1, (m, 2))
+        ends = torch.where(told.unsqueeze(-1), ends, 0.0).to(torch.int64)
 
         def with_now(past: Tensor, now: Tensor) -> Tensor:
             return torch.cat((past, now.unsqueeze(2)), 2)
@@ -136,12 +138,16 @@ class PoseGraph(RelativeTeam[History]):
         graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
         kind = "Pose3" if self.poses.dim == 3 else "Pose2"
         prior, between = (getattr(gtsam, f"{f}Factor{kind}") for f in ("Prior", "Between"))
-        tight = gtsam.noiseModel.Isotropic.Sigma(self.poses.dof, 1e-6)
+        tight = gtsam.noiseModel.Isotropic.Sigma(self.poses.dof, _TIGHT)
         graph.add(prior(steps - 1, self._to_gtsam(one.start[0, -1]), tight))
+        anywhere = self._noise([variance**0.5 for variance in self.uniform])
         odometry = self._noise(self.std)
         for uav in range(n):
             for k in range(steps):
                 initial.insert(uav * steps + k, self._to_gtsam(one.start[uav, k]))
+            if uav:
+                here = self.poses.identity(one.start)
+                graph.add(prior(uav * steps + steps - 1, self._to_gtsam(here), anywhere))
             for k in range(steps - 1):
                 key = uav * steps + k
                 graph.add(between(key, key + 1, self._to_gtsam(one.odometry[uav, k]), odometry))
@@ -228,7 +234,8 @@ class PoseGraph(RelativeTeam[History]):
     def _noise(self, std: Sequence[float]) -> Any:
         """A diagonal noise model; GTSAM puts a rotation in space first."""
         d = self.poses.dim
-        ordered = list(std) if d == 2 else [*std[d:], *std[:d]]
+        std = [max(size, _TIGHT) for size in std]
+        ordered = std if d == 2 else [*std[d:], *std[:d]]
         return self.gtsam.noiseModel.Diagonal.Sigmas(torch.tensor(ordered).double().numpy())
 
     def _to_gtsam(self, pose: Float64[Tensor, "P"]) -> Any:

@@ -14,6 +14,7 @@ from coloc_env.observation import prior_action
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
+from training.agreement import team_figures
 
 NUMERICAL = (ArithmeticError, RuntimeError, np.linalg.LinAlgError)  # what a filter may die of
 _HUGE = 1e30  # m; what lies beyond counts as infinite
@@ -117,6 +118,8 @@ def _fly(
                 belief = localizer.reset(observation) if belief is None else belief
                 belief, estimate = localizer.step(belief, observation)
                 own = localizer.diagnostics(belief)
+                said = localizer.team(belief)
+                own = own if said is None else own | team_figures(said, world.truth)
             except NotImplementedError:
                 raise
             except NUMERICAL as error:

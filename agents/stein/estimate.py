@@ -36,7 +36,7 @@ def covariance(
 ) -> Float64[Tensor, "B N D D"]:
     """Each holder's covariance of its own pose, in its tangent: inverse of the Gauss–Newton
     information of its window about the estimate. ``prior``: variances of a uniform pose. UAV 0 is
-    known."""
+    known. What odometry has added since is common to all matches: on average it adds up in full."""
     n, d = estimate.shape[2], poses.dof
     at_first, at_second = known.at_first.mT, known.at_second.mT
     here, there = (agents_of(estimate, index) for index in (window.first, window.second))
@@ -52,8 +52,13 @@ def covariance(
     grown = torch.cat((grown[..., :1],) * poses.dim + (grown[..., 1:],) * turns, -1)
     weight = inliers.sqrt().unsqueeze(-1) / (std * grown)
     rows = (weight.unsqueeze(-1) * jacobian).flatten(2, 3)
-    known = (1 / prior).repeat(n)
-    known[:d] = known[:d] * 1e12
-    joint = torch.linalg.inv(rows.mT @ rows + torch.diag(known))
+    before = (1 / prior).repeat(n)
+    before[:d] = before[:d] * 1e12
+    joint = torch.linalg.inv(rows.mT @ rows + torch.diag(before))
     own = torch.arange(n, device=estimate.device)
-    return joint.unflatten(-1, (n, d)).unflatten(2, (n, d))[:, own, own, :, own].movedim(0, 1)
+    blocks = joint.unflatten(-1, (n, d)).unflatten(2, (n, d))[:, own, own, :, own].movedim(0, 1)
+    share = (inliers / inliers.sum(-1, keepdim=True).clamp_min(1e-9)).unsqueeze(-1)
+    drift = (share * window.grown).sum(2)
+    return blocks + torch.diag_embed(
+        torch.cat((drift[..., :1],) * poses.dim + (drift[..., 1:],) * turns, -1)
+    )

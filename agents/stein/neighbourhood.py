@@ -1,7 +1,7 @@
 """The paper's own target (eq. 16): particles of one holder against those of the other."""
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.stein.likelihood import Fit, Scale
@@ -17,6 +17,7 @@ def fit_neighbours(
     window: Window,
     scale: Scale,
     beta: Float64[Tensor, "B H"],
+    talking: Bool[Tensor, "B H R"],
 ) -> Fit:
     """log P_Q = −Σ_k d_kᵀ Σ d_k, d_k = log(p_{j,k}⁻¹ (p_{i,r} T)): each holder's particles of its
     own pose, seen through a match, against the nearest of its partner's particles of its own.
@@ -41,7 +42,7 @@ def fit_neighbours(
     near = there.gather(3, wide).unflatten(3, nearest.shape[-2:])
     step = poses.minus(near, seen.unsqueeze(-2)).mean(-2)
     gauss = torch.exp(-0.5 * distance.mean(-1))
-    held = window.held.unsqueeze(-1)
+    held = (window.held & talking.gather(2, partner)).unsqueeze(-1)
     level = beta[..., None, None]
     inliers = torch.where(held, torch.where(level > 0, gauss / (gauss + level), 1.0), 0.0)
     moved = (inliers.unsqueeze(-1) * poses.carry(toward, step)).sum(2)

@@ -57,29 +57,29 @@ def matches(
     poses: type[Poses], observation: Observation, heard: Bool[Tensor, "B H N"], everyone: bool
 ) -> Matches:
     """The matches that holders are ends of or, with ``everyone``, those of all they hear as well
-    (each told by its first end, or known as the second)."""
+    (each told by its first end). A match with a UAV that is not ``heard`` is of no use: where it
+    went since is not known."""
     told = observation["relative_pose_mask"] > 0
     slots = told.shape[-1]
-    ends = torch.where(told, 1.0, 0.0).unsqueeze(-1) * observation["relative_pose_ends"].unflatten(
-        -1, (slots, 2)
-    )
+    ends = observation["relative_pose_ends"].unflatten(-1, (slots, 2))
     pose = observation["relative_poses"].unflatten(-1, (slots, poses.size)).double()
-    told = told & pose.isfinite().all(-1)
+    told = told & pose.isfinite().all(-1) & ends.isfinite().all(-1)
     pose = torch.where(told.unsqueeze(-1), pose, poses.identity(pose))
-    first, second = ends.nan_to_num().to(torch.int64).unbind(-1)
-    if not everyone:
-        return Matches(first, second, pose, told)
-    n = told.shape[1]
-    own = torch.eye(n, dtype=torch.bool, device=told.device)
-    teller = torch.arange(n, device=told.device).unsqueeze(-1)
-    as_first = told & (first == teller)
-    passed = torch.where(own.unsqueeze(-1), told.unsqueeze(1), as_first.unsqueeze(1))
-    passed = passed & (heard | own).unsqueeze(-1)
-
-    def spread(values: Tensor) -> Tensor:
-        return values.unsqueeze(1).expand(-1, n, *values.shape[1:]).flatten(2, 3)
-
-    return Matches(spread(first), spread(second), spread(pose), passed.flatten(2))
+    first, second = torch.where(told.unsqueeze(-1), ends, 0.0).to(torch.int64).unbind(-1)
+    if everyone:
+        n = told.shape[1]
+        holder = torch.arange(n, device=told.device).view(-1, 1, 1)
+        teller = holder.view(1, -1, 1)
+        mine = holder == teller
+        news = (first == teller) & (second.unsqueeze(1) != holder)
+        told = told.unsqueeze(1) & heard.unsqueeze(-1) & (mine | news)
+        told = told.flatten(2)
+        pose, first, second = (
+            part.unsqueeze(1).expand(-1, n, *part.shape[1:]).flatten(2, 3)
+            for part in (pose, first, second)
+        )
+    told = told & heard.gather(2, first) & heard.gather(2, second)
+    return Matches(first, second, pose, told)
 
 
 def moved(

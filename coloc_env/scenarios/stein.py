@@ -57,14 +57,15 @@ def stein3d(
     outliers: float = 0.2,
     matches_per_step: int = 1,
     relative_pose_noise: tuple[float, float] = (0.05, 2.0),
-    odometry_noise: tuple[float, float] = (0.005, 0.2),
+    odometry_noise: tuple[float, float] = (0.0, 0.0),
     comm_radius: float | None = None,
     message_loss: float = 0.0,
     failure_rate: float = 0.0,
     reward: str = "error",
 ) -> Scenario:
     """The same in space: UAVs that stand still at (0, 0, 0), (2, 0, 0), (0, 2, 0), … m, level, in a
-    cube of 10 m (eq. 27), if no other ``motion`` is asked for. Overrides as ``stein2d-v0``."""
+    cube of 10 m (eq. 27), if no other ``motion`` is asked for, and know it: their odometry has no
+    noise by default. Overrides as ``stein2d-v0``."""
     return _stein(dim=3, name="stein3d-v0", **locals())
 
 

@@ -79,6 +79,8 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, dropout=0.2),
     "swarm": lambda: make_scenario("swarm-v0", n_uavs=8, anchors=0.4, nlos_time=3.0),
     "campus": lambda: make_scenario("campus-v0", flight="s3", dt=0.5),
+    "stein2d": lambda: make_scenario("stein2d-v0", matches_per_step=2),
+    "stein3d": lambda: make_scenario("stein3d-v0", n_uavs=4),
 }
 ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
@@ -104,14 +106,18 @@ CHOSEN = {
     **dict.fromkeys(("mds", "dwmds", "vmds"), ("nlos", "anchors", "slots")),
     "fcmds": ("anchors", "slots"),
     "gn": ("slots",),
+    **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
 }
-ELSEWHERE = [f for f in FAMILIES if f not in ("wsn", "swarm", "campus")]
+SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d")
+ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE) if n not in TWINS),
     *((n, f) for n in VARIANTS for f in ("default", "plane")),
     *((n, "wsn") for n in ("pf", "ekf")),
     *((n, "swarm") for n in ("dead_reckoning", "ekf", "ekf_joint", "pf", "ekf:robust=huber")),
     ("dead_reckoning", "campus"),
+    *((n, "stein2d") for n in ("dead_reckoning", "ekf")),
+    *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
 ]
@@ -149,6 +155,8 @@ def build(name: str, scenario: Scenario) -> Localizer:
     few: dict[str, Any] = {"particles": PARTICLES} if "particles" in known else {}
     if "bounds" in known and known["bounds"].default is not None:
         few["bounds"] = (PARTICLES - 10, PARTICLES + 20)
+    if "every" in known:
+        few["every"] = 2
     if "weights" in known:
         few["weights"] = "none"
     if "main" in known:
@@ -157,7 +165,10 @@ def build(name: str, scenario: Scenario) -> Localizer:
 
 
 def room(name: str, **overrides: Any) -> Scenario:
-    """``indoor-v0``; for those that need anchors, among anchors alone."""
+    """``indoor-v0``; for those that need anchors, among anchors alone; ``stein2d-v0`` for those
+    that need relative poses."""
+    if "stein2d" in CHOSEN.get(name, ()):
+        return make_scenario("stein2d-v0", **overrides)
     among: dict[str, Any] = {"anchors": 8, "landmarks": 0} if name in CHOSEN else {}
     return make_scenario("indoor-v0", **among, **overrides)
 

@@ -131,6 +131,36 @@ CHANGED: dict[str, dict[str, Any]] = {
         "gps_cep": 1.5,
         "reward": "squared",
     },
+    "stein2d-v0": {
+        "n_uavs": 4,
+        "horizon": 17,
+        "dt": 0.2,
+        "size": 12.0,
+        "motion": "circle",
+        "outliers": 0.9,
+        "matches_per_step": 2,
+        "relative_pose_noise": (0.1, 4.0),
+        "odometry_noise": (0.02, 1.0),
+        "comm_radius": 1.0,
+        "message_loss": 0.5,
+        "failure_rate": 1.0,
+        "reward": "squared",
+    },
+    "stein3d-v0": {
+        "n_uavs": 4,
+        "horizon": 17,
+        "dt": 0.2,
+        "size": 12.0,
+        "motion": "random",
+        "outliers": 0.9,
+        "matches_per_step": 2,
+        "relative_pose_noise": (0.1, 4.0),
+        "odometry_noise": (0.02, 1.0),
+        "comm_radius": 1.0,
+        "message_loss": 0.5,
+        "failure_rate": 1.0,
+        "reward": "squared",
+    },
 }
 # Overrides that show only together with another.
 WITH: dict[str, dict[str, dict[str, Any]]] = {
@@ -156,6 +186,8 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "wall_excess": {"flight": "s3", "wall_loss": 0.0},
         "failure_rate": {"horizon": 4},
     },
+    "stein2d-v0": {"failure_rate": {"horizon": 4}},
+    "stein3d-v0": {"failure_rate": {"horizon": 4}},
 }
 SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchors": 0.3, "nlos": 0.4}}
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
