@@ -68,11 +68,10 @@ def matches(
     first, second = torch.where(told.unsqueeze(-1), ends, 0.0).to(torch.int64).unbind(-1)
     if everyone:
         n = told.shape[1]
-        holder = torch.arange(n, device=told.device).view(-1, 1, 1)
-        teller = holder.view(1, -1, 1)
-        mine = holder == teller
-        news = (first == teller) & (second.unsqueeze(1) != holder)
-        told = told.unsqueeze(1) & heard.unsqueeze(-1) & (mine | news)
+        teller = torch.arange(n, device=told.device).unsqueeze(-1)
+        holder = teller.unsqueeze(-1)
+        news = (first == teller).unsqueeze(1) & (second.unsqueeze(1) != holder)
+        told = told.unsqueeze(1) & heard.unsqueeze(-1) & ((holder == teller) | news)
         told = told.flatten(2)
         pose, first, second = (
             part.unsqueeze(1).expand(-1, n, *part.shape[1:]).flatten(2, 3)
