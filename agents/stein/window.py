@@ -88,10 +88,11 @@ def moved(
     std: tuple[float, float],
 ) -> Window:
     """T ← D_i⁻¹ T D_j with what each agent moved. Odometry of ``std`` (m, rad) a step adds its
-    variance at both ends, and turns what the first end sees at a distance |t|."""
+    variance at both ends, and turns what the first end sees at a distance |t|, which moves all
+    axes but one."""
     here, there = agents_of(step, window.first), agents_of(step, window.second)
     pose = poses.between(here, poses.compose(window.pose, there))
-    lever = poses.split(pose)[0].square().sum(-1)
+    lever = poses.split(pose)[0].square().sum(-1) * (poses.dim - 1) / poses.dim
     turn = torch.full_like(lever, 2 * std[1] ** 2)
     added = torch.stack((2 * std[0] ** 2 + lever * std[1] ** 2, turn), -1)
     return window.replace(pose=pose, grown=window.grown + added)
