@@ -17,10 +17,17 @@ class Paper(StrEnum):
     pfnn = "pfnn"
     nnhpff = "nnhpff"
     stdcl = "stdcl"
+    cspf = "cspf"
     marl = "marl"
 
 
-_RUNS = {Paper.pfnn: 20, Paper.nnhpff: 100, Paper.stdcl: 50, Paper.marl: 40}
+_RUNS = {
+    Paper.pfnn: 20,
+    Paper.nnhpff: 100,
+    Paper.stdcl: 50,
+    Paper.cspf: 100,
+    Paper.marl: 40,
+}
 
 
 class Part(StrEnum):
@@ -39,13 +46,15 @@ _PARTS = {
     Paper.pfnn: (Part.paper, Part.robustness, Part.all),
     Paper.nnhpff: (Part.paper, Part.robustness, Part.all),
     Paper.stdcl: (Part.paper, Part.stress, Part.learned, Part.campus, Part.real, Part.all),
+    Paper.cspf: (Part.paper, Part.robustness, Part.all),
     Paper.marl: (Part.all,),
 }
 
 
 def reproduce(
     paper: Annotated[
-        Paper, typer.Argument(metavar="PAPER", help="**pfnn**, **nnhpff**, **stdcl**, **marl**")
+        Paper,
+        typer.Argument(metavar="PAPER", help="**pfnn**, **nnhpff**, **stdcl**, **cspf**, **marl**"),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report and store.")],
     part: Annotated[
@@ -58,8 +67,8 @@ def reproduce(
     runs: Annotated[
         int | None,
         typer.Option(
-            help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff, 50 for **stdcl** (a "
-            "tenth beyond its main table), 40 for marl."
+            help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff and cspf, 50 for **stdcl** "
+            "(a tenth beyond its main table), 40 for marl."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first world.")] = 0,
@@ -112,6 +121,8 @@ def reproduce(
 
     coloc reproduce stdcl --out results/stdcl --part stress --variants nlos-0.15,nlos-0.5
 
+    coloc reproduce cspf --out results/cspf --jobs 2
+
     coloc reproduce marl --out results/marl --jobs 2
     """
     for name, value in (("runs", runs), ("steps", steps), ("jobs", jobs)):
@@ -126,6 +137,7 @@ def reproduce(
     import torch
 
     from training.evaluate import split_agents
+    from training.reproduce.cspf.run import reproduce as run_cspf
     from training.reproduce.marl.run import reproduce as run_marl
     from training.reproduce.nnhpff.run import reproduce as run_nnhpff
     from training.reproduce.pfnn.run import reproduce as run_pfnn
@@ -151,6 +163,8 @@ def reproduce(
             run_nnhpff(out, part.value, count, seed, where, steps, jobs, fly, tell, _say)
         elif paper is Paper.stdcl:
             run_stdcl(out, part.value, count, seed, where, steps, jobs, fly, tell, _say)
+        elif paper is Paper.cspf:
+            run_cspf(out, part.value, count, seed, wanted, where, steps, jobs, fly, tell, _say)
         else:
             run_pfnn(out, part.value, count, seed, wanted, where, steps, jobs, fly, tell, _say)
     typer.echo(f"written to {out}/report.md")

@@ -1,0 +1,81 @@
+"""``coloc reproduce cspf``: what is missing is flown, then the report is written."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from coloc_env.options import unknown
+from training.evaluate import Progress
+from training.reproduce.cspf import plan, report
+from training.reproduce.pool import Note, fly
+from training.reproduce.reporting import failures
+from training.reproduce.store import Store
+from training.reproduce.study import WORLD, Piece, Study, Variant
+from training.staging import staged_folder
+
+NAMES = (*report.FILES, "report.md")
+_STORE = "store"
+
+
+def reproduce(
+    out: Path,
+    part: str,
+    runs: int,
+    seed: int,
+    wanted: Sequence[str] | None,
+    where: Sequence[str] | None,
+    steps: int | None,
+    jobs: int,
+    missing: bool,
+    tell: Progress,
+    note: Note,
+) -> None:
+    """Fly what the store in ``out`` lacks, then write the report of ``part`` there.
+
+    ``wanted``: these agents only; ``where``: these variants only; None: all. ``steps``: at most so
+    many of each run. ``missing=False`` flies nothing.
+    """
+    own, beyond = part != "robustness", part != "paper"
+    study = Study(Store(out / _STORE), seed)
+    planned = _plan(own, beyond, runs, steps)
+    keys = list(dict.fromkeys(variant.key for variant, _, _ in planned))
+    for key in where or ():
+        if key not in keys:
+            raise ValueError(unknown("variant", key, keys))
+    pieces: list[Piece] = []
+    for variant, agents, count in planned:
+        if where is not None and variant.key not in where:
+            study.failed[variant.key, WORLD] = "not asked for"
+            continue
+        for agent in (WORLD, *agents):
+            if wanted is None or agent in (WORLD, *wanted):
+                pieces += study.pieces(variant, agent, count)
+            else:
+                study.do_without(study.pieces(variant, agent, count))
+    if missing:
+        fly(study, pieces, jobs, tell, note)
+    else:
+        study.do_without(pieces)
+    text = ["# CSPF, reproduced", "", f"{plan.TITLE}.", ""]
+    with staged_folder(out, NAMES) as folder:
+        if own:
+            text += report.paper_part(study, runs, steps, folder)
+        if beyond:
+            text += report.beyond_part(study, runs, steps)
+        text += failures(study)
+        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+
+
+def _plan(
+    own: bool, beyond: bool, runs: int, steps: int | None
+) -> list[tuple[Variant, tuple[str, ...], int]]:
+    """Variants, who flies in them, and how often."""
+    planned: list[tuple[Variant, tuple[str, ...], int]] = []
+    if own:
+        for dim in plan.DIMS:
+            beside = (*plan.BESIDE, *plan.LITERAL)
+            planned.append((plan.published(dim, steps), beside, runs))
+        planned += [(variant, agents, runs) for variant, agents in plan.shares(steps)]
+    if beyond:
+        for variant, agents in (plan.clouds(steps), *plan.teams(steps), *plan.hard(steps)):
+            planned.append((variant, agents, plan.runs_in(variant, runs)))
+    return planned
