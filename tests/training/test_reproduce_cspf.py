@@ -79,7 +79,7 @@ def test_what_is_alike_or_absent_is_not_claimed() -> None:
 def test_every_world_can_be_built_and_has_a_key_of_its_own() -> None:
     planned = [v for v, _ in (*plan.shares(9), *plan.teams(9), *plan.hard(9), plan.clouds(9))]
     keys = {variant.key for variant in planned}
-    assert len(keys) == len({v.overrides + (v.scenario,) for v in planned})
+    assert len(keys) == len({(*v.overrides, v.scenario) for v in planned})
     for variant in planned:
         assert variant.build().horizon == 9
         assert 1 <= plan.runs_in(variant, 10) <= 10
