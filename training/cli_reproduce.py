@@ -67,7 +67,7 @@ def reproduce(
     runs: Annotated[
         int | None,
         typer.Option(
-            help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff and cspf, 50 for **stdcl** "
+            help="Worlds: 20 for **pfnn** (figure 9: 30), 100 for nnhpff and cspf, 50 for stdcl "
             "(a tenth beyond its main table), 40 for marl."
         ),
     ] = None,
