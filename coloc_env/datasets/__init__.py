@@ -7,12 +7,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from coloc_env.datasets import euroc, hanyang, miluv, mrclam, tiers, tuc
+from coloc_env.datasets import euroc, hanyang, miluv, mrclam, murp, tiers, tuc
 from coloc_env.datasets.euroc import load_euroc
 from coloc_env.datasets.files import DataError, data_root, dataset_folder
 from coloc_env.datasets.hanyang import load_hanyang
 from coloc_env.datasets.miluv import load_miluv
 from coloc_env.datasets.mrclam import load_mrclam
+from coloc_env.datasets.murp import load_murp
 from coloc_env.datasets.recording import Recording, Table, Track
 from coloc_env.datasets.tiers import load_tiers
 from coloc_env.datasets.tuc import load_tuc
@@ -29,6 +30,7 @@ __all__ = [
     "load_hanyang",
     "load_miluv",
     "load_mrclam",
+    "load_murp",
     "load_tiers",
     "load_tuc",
     "sequences",
@@ -43,7 +45,7 @@ class _Dataset:
     sequences_in: Callable[[Path], dict[str, int]]
 
 
-def _folders(robots_in: Callable[[Path], tuple[str, ...]]) -> Callable[[Path], dict[str, int]]:
+def _folders(robots_in: Callable[[Path], tuple[Any, ...]]) -> Callable[[Path], dict[str, int]]:
     """A folder per sequence, which ``robots_in`` tells from others."""
 
     def sequences_in(home: Path) -> dict[str, int]:
@@ -61,6 +63,7 @@ _DATASETS = {
     "tuc": _Dataset(load_tuc, tuc.sequences_in),
     "hanyang": _Dataset(load_hanyang, hanyang.sequences_in),
     "tiers": _Dataset(load_tiers, tiers.sequences_in),
+    "murp": _Dataset(load_murp, _folders(murp.agents_in)),
 }
 DATASETS = tuple(_DATASETS)
 

@@ -24,11 +24,13 @@ HOMES = {
     "tuc": "https://github.com/TUC-ProAut/libRSF",
     "hanyang": "https://doi.org/10.5281/zenodo.15226105",
     "tiers": "https://github.com/TIERS/uwb-cooperative-mrs-localization",
+    "murp": "https://github.com/mit-acl/murp-datasets",
 }
 _FOLDERS = {  # where not the name
     "tuc": "tuc_indoor_uwb",
     "hanyang": "hanyang_outdoor_uwb",
     "tiers": "tiers_mrs",
+    "murp": "murp/parsed",
 }
 _CACHE_VERSION = 1
 
@@ -91,6 +93,7 @@ class FileFormat:
             stamp is ``stamp_column``. Otherwise ``#`` starts a comment.
         whole: those of ``columns`` that hold whole numbers.
         stamp_column: the stamp's name in a header.
+        optional: those of ``columns`` that may be empty, which reads as NaN; only with ``header``.
         words: every line begins with one of these words, and those with the first are the rows;
             none: all lines are rows, and begin with their stamp.
     """
@@ -102,6 +105,7 @@ class FileFormat:
     whole: tuple[str, ...] = ()
     stamp_column: str = "timestamp"
     words: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,7 +166,10 @@ def _parse(path: Path, form: FileFormat) -> Rows:
         raise DataError(f"{path}: no data")
     for name in form.columns:
         column = table[name]
-        if not (finite := np.isfinite(column)).all():
+        finite = np.isfinite(column)
+        if name in form.optional:
+            finite |= np.isnan(column)
+        if not finite.all():
             fail(path, form, ~finite, f"{name} is not a finite number")
         if name in form.whole and (broken := column != np.rint(column)).any():
             fail(path, form, broken, f"{name} is {column[broken][0]:g}, not a whole number")
@@ -182,6 +189,7 @@ def _load(path: Path, form: FileFormat) -> NDArray[np.void]:
         return np.loadtxt(
             list(_marked(path, form)) if form.words else path,
             dtype=[(name or f"column {i}", kinds.get(name, "S1")) for i, name in enumerate(names)],
+            converters={i: _optional for i, name in enumerate(names) if name in form.optional},
             comments=None if form.header else "#",
             delimiter=form.delimiter,
             skiprows=int(form.header),
@@ -189,6 +197,10 @@ def _load(path: Path, form: FileFormat) -> NDArray[np.void]:
             encoding="utf-8",
             ndmin=1,
         )
+
+
+def _optional(field: str) -> float:
+    return float(field) if field else np.nan
 
 
 def _marked(path: Path, form: FileFormat) -> Iterator[str]:
@@ -275,7 +287,8 @@ def _explain(path: Path, form: FileFormat, error: ValueError) -> NoReturn:
             if len(fields) != len(names):
                 raise DataError(f"{where}: {len(fields)} columns, not {len(names)}") from None
             for name, field in zip(names, fields, strict=True):
-                if name in form.columns and not _is_number(field):
+                empty = not field and name in form.optional
+                if name in form.columns and not empty and not _is_number(field):
                     raise DataError(f"{where}: {name} is {field[:40]!r}, not a number") from None
     raise DataError(f"{path}: cannot be parsed: {' '.join(str(error).split())}") from None
 

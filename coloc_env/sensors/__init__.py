@@ -12,7 +12,7 @@ from coloc_env.sensors.position_fix import PositionFix
 from coloc_env.sensors.range_noise import RangeNoise
 from coloc_env.sensors.ranging import AnchorRanging, Ranging
 from coloc_env.sensors.reference import Reference
-from coloc_env.sensors.relative_pose import RelativePose
+from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose
 from coloc_env.sensors.slow_flight import SlowFlight
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "RangeNoise",
     "Ranging",
     "Recorded",
+    "RecordedPoses",
     "Reference",
     "RelativePose",
     "Sensor",

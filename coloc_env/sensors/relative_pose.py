@@ -11,6 +11,7 @@ from coloc_env import noise
 from coloc_env.geometry import poses_in, rotate_by
 from coloc_env.motion import Arena
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+from coloc_env.tape import Tape
 
 
 @dataclass(frozen=True)
@@ -48,27 +49,21 @@ class RelativePose(Sensor):
         arena = window.layout.arena
         first, second = _pairs(window.keys, arena.n_uavs, self.matches)
         pose = torch.cat((window.motion.position, window.motion.attitude), -1)
-        shown = self._shown(_of(pose, second), window.keys, arena)
+        wrong, other = self.mistaken(window.keys, arena)
+        shown = torch.where(wrong, other, _of(pose, second))
         clean = poses_in(arena.dim).between(_of(pose, first), shown).to(torch.float32)
         pose = self._noisy(clean, window.keys, arena.dim)
-        held = _held(window, first, second)
-        ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
-        return {
-            "relative_poses": (pose.unsqueeze(2) * held.unsqueeze(-1)).flatten(-2),
-            "relative_pose_mask": held.to(torch.float32),
-            "relative_pose_ends": ends.flatten(-2).to(torch.float32),
-        }
+        return _leaves(first, second, pose, _held(window, first, second))
 
-    def _shown(
-        self, pose: Float64[Tensor, "R K M P"], keys: Int64[Tensor, "R K"], arena: Arena
-    ) -> Float64[Tensor, "R K M P"]:
-        """What each match shows: its second UAV's pose or, if it is wrong, any."""
-        m, low = self.matches, pose.new_tensor(arena.low)
+    def mistaken(
+        self, keys: Int64[Tensor, "R K"], arena: Arena
+    ) -> tuple[Bool[Tensor, "R K M 1"], Float64[Tensor, "R K M P"]]:
+        """Which matches are wrong, and the pose in the world that they show instead."""
+        m, low = self.matches, torch.tensor(arena.low, dtype=torch.float64, device=keys.device)
         drawn = noise.uniform(keys, "relative_pose.outlier", m * (1 + arena.dim)).double()
         wrong, place = drawn.unflatten(-1, (m, -1)).split((1, arena.dim), -1)
         place = low + (low.new_tensor(arena.high) - low) * place
-        other = torch.cat((place, _uniform_attitudes(keys, m, arena.dim)), -1)
-        return torch.where(wrong < self.outliers, other, pose)
+        return wrong < self.outliers, torch.cat((place, _uniform_attitudes(keys, m, arena.dim)), -1)
 
     def _noisy(
         self, clean: Float32[Tensor, "R K M P"], keys: Int64[Tensor, "R K"], dim: int
@@ -82,6 +77,50 @@ class RelativePose(Sensor):
         if dim == 3:
             attitude = torch.where(attitude[..., :1] < 0, -attitude, attitude)
         return torch.cat((position, attitude), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPoses(Sensor):
+    """The leaves of ``sensor`` from a recording: at step k the pose ``poses[k, m]`` [T, M, P] of
+    the second UAV of ``pairs[m]`` in the body frame of the first, where it is ``there`` [T, M].
+
+    What is recorded has its own noise. Wrong matches are drawn as ``sensor`` draws them, in place
+    of what is recorded.
+    """
+
+    sensor: RelativePose
+    pairs: tuple[tuple[int, int], ...]
+    poses: Tape
+    there: Tape
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return self.sensor.leaves(layout)
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        arena, steps = window.layout.arena, window.steps
+        first, second = torch.tensor(self.pairs, device=steps.device).mT.unbind(0)
+        first, second = (x.expand(*steps.shape, -1) for x in (first, second))
+        wrong, other = self.sensor.mistaken(window.keys, arena)
+        seen_from = _of(torch.cat((window.motion.position, window.motion.attitude), -1), first)
+        shown = poses_in(arena.dim).between(seen_from, other)
+        pose = torch.where(wrong, shown, self.poses.at(steps)).to(torch.float32)
+        held = _held(window, first, second) & self.there.at(steps).unsqueeze(2)
+        return _leaves(first, second, pose, held)
+
+
+def _leaves(
+    first: Int64[Tensor, "R K M"],
+    second: Int64[Tensor, "R K M"],
+    pose: Float32[Tensor, "R K M P"],
+    held: Bool[Tensor, "R K N M"],
+) -> dict[str, Tensor]:
+    """What each UAV is told of the matches: those that it holds."""
+    ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
+    return {
+        "relative_poses": (pose.unsqueeze(2) * held.unsqueeze(-1)).flatten(-2),
+        "relative_pose_mask": held.to(torch.float32),
+        "relative_pose_ends": ends.flatten(-2).to(torch.float32),
+    }
 
 
 def _pairs(
