@@ -1,5 +1,6 @@
 """Finding sequences in the data folder."""
 
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,9 @@ LABYRINTH = {
         "GT": "point2 0.5 0 0 0 0 0 0\n",
     }.items()
 }
+ENDS = [f"{end}_{n}" for end in "AB" for n in ("x", "y", "z", "roll", "pitch", "yaw")]
+BETWEEN = [f"{i}_{j}" for i in range(1, 7) for j in range(1, 7)]
+RANGED = ",".join(("t", *ENDS, *BETWEEN)) + "\n0.0" + ",1.0" * 48 + "\n"
 DRIVE = {"Barcodes.dat": "1 5\n2 6\n9 7\n", "Landmark_Groundtruth.dat": "9 0 0 0 0\n"}
 
 
@@ -45,6 +49,10 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     contents |= {"mrclam/other": {"readme.txt": "nothing"}, "miluv": {"readme.txt": "nothing"}}
     cases = ("NLOS/Trajectory_A/Case_1", "LOS/Trajectory_B/Case_3", "LOS/Trajectory_B/Case_4")
     contents |= {f"hanyang_outdoor_uwb/{case}": WALK for case in cases}
+    for trial, agents in (("02", 2), ("03", 3), ("04", 3)):
+        pairs = permutations(range(1, agents + 1), 2)
+        names = [f"{trial}_base-{a}_targ-{b}_win-1_step-1.csv" for a, b in pairs]
+        contents[f"murp/parsed/{trial}"] = dict.fromkeys(names, RANGED)
     contents["tuc_indoor_uwb"] = LABYRINTH | {"c_GT.txt": "", "readme.txt": "nothing"}
     for folder, files in contents.items():
         (root / folder).mkdir(parents=True)
@@ -58,6 +66,7 @@ def test_sequences(data: Path) -> None:
     assert sequences("euroc", data) == ("MH_01", "MH_02", "V1_01", "V1_02", "V2_01")
     assert sequences("miluv") == ()
     assert sequences("tuc") == ("a", "b")
+    assert sequences("murp") == ("02", "03", "04")
     cases = ("LOS/Trajectory_B/Case_3", "LOS/Trajectory_B/Case_4", "NLOS/Trajectory_A/Case_1")
     assert sequences("hanyang") == cases
 
@@ -72,6 +81,8 @@ def test_sequences(data: Path) -> None:
         ("euroc", "V1_02,V1_01", "euroc/V1_02+V1_01"),
         ("tuc", None, "tuc/a"),
         ("tuc", "b", "tuc/b"),
+        ("murp", None, "murp/03"),
+        ("murp", "02", "murp/02"),
         ("hanyang", None, "hanyang/LOS/Trajectory_B/Case_3"),
         ("hanyang", "NLOS/Trajectory_A/Case_1", "hanyang/NLOS/Trajectory_A/Case_1"),
     ],
@@ -84,7 +95,11 @@ def test_which_is_loaded(data: Path, name: str, sequence: str | None, loaded: st
 @pytest.mark.parametrize(
     ("name", "sequence", "reason"),
     [
-        ("tum", None, "no dataset 'tum', there are: mrclam, euroc, miluv, tuc, hanyang, tiers"),
+        (
+            "tum",
+            None,
+            "no dataset 'tum', there are: mrclam, euroc, miluv, tuc, hanyang, tiers, murp",
+        ),
         ("mrclam", "d", "no sequence 'd' in .*mrclam, there are: a, b, c"),
         ("mrclam", "a,b", "one sequence at a time, not a,b"),
         ("euroc", "V1_01,V9", "no sequence 'V9'"),
