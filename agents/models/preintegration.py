@@ -123,6 +123,35 @@ def predict(
     return concat((pose[..., :3] + (x[..., 3:6] + 0.5 * fall) * t, velocity, pose[..., 3:]))
 
 
+def transition(
+    x: Float[Tensor, "*s 10"], window: Preintegrated
+) -> tuple[Float[Tensor, "*s 9 15"], Float[Tensor, "*s 9 9"]]:
+    """Derivative of the predicted state's error by the error ``[δp, δv, δφ, δb_a, δb_g]`` of the
+    state and bias at the start (at the window's own bias), and the covariance of the window's
+    noise, as it enters."""
+    rotation = quaternion_matrix(x[..., 6:])
+    position, velocity, turn = window.increments.split((3, 3, 4), -1)
+    eye = torch.eye(3, dtype=x.dtype, device=x.device).expand_as(rotation)
+    zero, t = torch.zeros_like(rotation), window.duration[..., None, None]
+    state = torch.cat(
+        (
+            torch.cat((eye, t * eye, -rotation @ cross_matrix(position)), -1),
+            torch.cat((zero, eye, -rotation @ cross_matrix(velocity)), -1),
+            torch.cat((zero, zero, quaternion_matrix(turn).mT), -1),
+        ),
+        -2,
+    )
+    into = torch.cat(
+        (
+            torch.cat((rotation, zero, zero), -1),
+            torch.cat((zero, rotation, zero), -1),
+            torch.cat((zero, zero, eye), -1),
+        ),
+        -2,
+    )
+    return torch.cat((state, into @ window.bias_jacobian), -1), into @ window.covariance @ into.mT
+
+
 def perturb(
     increments: Float[Tensor, "*s 10"], delta: Float[Tensor, "*s 9"]
 ) -> Float[Tensor, "*s 10"]:

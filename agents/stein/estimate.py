@@ -1,5 +1,7 @@
 """What a holder says: the mean around its best particle, and how well its window determines it."""
 
+from typing import Protocol
+
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -9,8 +11,20 @@ from agents.stein.window import Window, agents_of
 from coloc_env.geometry import Poses
 
 
+class Manifold(Protocol):
+    """Where means are taken: poses, or whole states."""
+
+    @staticmethod
+    def plus(x: Tensor, xi: Tensor, /) -> Tensor:
+        """``x ⊞ ξ``."""
+
+    @staticmethod
+    def minus(y: Tensor, x: Tensor, /) -> Tensor:
+        """``y ⊟ x``."""
+
+
 def map_estimate(
-    poses: type[Poses],
+    poses: type[Manifold] | Manifold,
     x: Float64[Tensor, "B H N m P"],
     log_density: Float64[Tensor, "B H m"],
     k: Float64[Tensor, "B H m m"],

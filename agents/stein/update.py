@@ -71,6 +71,11 @@ def stein_step(
     return torch.cat(parts, -1)
 
 
+def mean_over(near: Kernel, values: Float64[Tensor, "B H m E"]) -> Float64[Tensor, "B H m E"]:
+    """Kernel-weighted means of what particles have beside their poses."""
+    return _mixed(near.k, values) / near.k.sum(-1, keepdim=True)
+
+
 def _mixed(k: Float64[Tensor, "B H m m"], values: Float64[Tensor, "B H m *x"]) -> Tensor:
     """Σ_r k_lr v_r."""
     return (k @ values.flatten(3)).unflatten(-1, values.shape[3:])

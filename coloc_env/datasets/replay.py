@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 
 from coloc_env.datasets.files import DataError
-from coloc_env.datasets.grid import Grid, imu_on, last_on, odometry_on, slots_on, truth_on
+from coloc_env.datasets.grid import (
+    Grid,
+    held_intervals,
+    imu_on,
+    last_on,
+    odometry_on,
+    slots_on,
+    truth_on,
+)
 from coloc_env.datasets.recording import Floats, Recording, Table
 from coloc_env.motion import Arena, Recorded
 from coloc_env.sensors import (
@@ -17,6 +25,7 @@ from coloc_env.sensors import (
     LandmarkBearings,
     Odometry,
     Ranging,
+    RecordedImu,
     UavBearings,
 )
 from coloc_env.sensors import Recorded as RecordedSensor
@@ -55,6 +64,24 @@ def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) ->
         leaf[:, :3] -= own[3:]
         tapes.append(leaf)
     return RecordedSensor(sensor, {"imu": _tape(tapes)})
+
+
+def recorded_imu_samples(
+    recording: Recording, grid: Grid, sensor: Imu, bias: Floats
+) -> RecordedImu:
+    """``recorded_imu``, and beside the mean over each step its samples, less their bias."""
+    held = [held_intervals(grid, table) for table in recording.streams["imu"]]
+    width = max(durations.shape[1] for _, durations in held)
+    samples, durations = [], []
+    for (values, lasting), own in zip(held, bias, strict=True):
+        there = (lasting > 0)[..., None]
+        forces = np.concatenate((values[..., 3:] - own[3:], values[..., :3] - own[:3]), -1) * there
+        pad = ((0, 0), (0, width - lasting.shape[1]))
+        samples.append(np.pad(forces, (*pad, (0, 0))).reshape(grid.count, -1))
+        durations.append(np.pad(lasting, pad))
+    mean = recorded_imu(recording, grid, sensor, bias).tape
+    tapes = {"imu_samples": _tape(samples), "imu_held": _tape(durations)}
+    return RecordedImu(sensor, mean | tapes)
 
 
 def recorded_odometry(

@@ -5,6 +5,7 @@ from coloc_env.scenarios import indoor as _indoor  # noqa: F401
 from coloc_env.scenarios import replay as _replay  # noqa: F401
 from coloc_env.scenarios import replay_anchors as _replay_anchors  # noqa: F401
 from coloc_env.scenarios import replay_murp as _replay_murp  # noqa: F401
+from coloc_env.scenarios import replay_stein as _replay_stein  # noqa: F401
 from coloc_env.scenarios import replay_team as _replay_team  # noqa: F401
 from coloc_env.scenarios import stein as _stein  # noqa: F401
 from coloc_env.scenarios import swarm as _swarm  # noqa: F401

@@ -11,7 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from coloc_env.datasets import Recording, load
+from coloc_env.datasets.euroc import room
 from coloc_env.datasets.grid import Grid, common_grid
+from coloc_env.datasets.recording import Floats
 from coloc_env.datasets.replay import (
     arena_of,
     lever_arms,
@@ -40,9 +42,21 @@ from coloc_env.sensors import (
     UavBearings,
 )
 
-# Mean of the bias states that the ground truth of MH_04_difficult carries: another flight of the
-# same vehicle, so no segment is calibrated on itself. Gyro (rad/s), accelerometer (m/s²), FLU body.
-_EUROC_BIAS = (0.07665, -0.02107, -0.00214, 0.0595, -0.1371, -0.0273)
+# Means of the bias states that the ground truths of two flights carry, each in a building of its
+# own: a room's flights are corrected by the one elsewhere, of the same vehicle, so that no segment
+# is calibrated on itself. Gyro (rad/s), accelerometer (m/s²), FLU body.
+_MH_04 = (0.07665, -0.02107, -0.00214, 0.0595, -0.1371, -0.0273)
+_V1_03 = (0.07660, -0.02181, -0.00235, 0.0896, -0.1795, -0.0237)
+
+
+def euroc_bias(recording: Recording) -> Floats:
+    """The IMU's calibrated bias [N, 6] for a team of one room."""
+    bias = _V1_03 if room(recording.robots[0]) == "MH" else _MH_04
+    return np.tile(bias, (len(recording.robots), 1))
+
+
+# What is left of the bias: prior and walk wide enough for what a calibration flight cannot know.
+LEFT_OVER = Inertial(0.1, 0.003, accel_walk=0.01, gyro_walk=1e-4)
 
 
 def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
@@ -143,17 +157,16 @@ def replay_euroc(
     """Three real flights of one vehicle in one room "together" (EuRoC V1): IMU, biases and motion
     are real, UWB and landmarks simulated as in ``indoor-v0``.
 
-    The IMU's bias is calibrated on another flight (MH_04), what is left of it is estimated unless
-    ``estimate_bias=false``.
+    The IMU's bias is calibrated on a flight in another room (MH_04, for the MH flights V1_03), what
+    is left of it is estimated unless ``estimate_bias=false``.
     """
     if landmarks < 0:
         raise ValueError(f"landmarks={landmarks} is not allowed: a count ≥ 0")
     recording = loaded("euroc", sequence, data)
     grid = cut(common_grid(recording, dt, ("imu",)), span)
     imu = Imu(accel_std, gyro_std)
-    bias = np.tile(_EUROC_BIAS, (len(recording.robots), 1))
     uwb = Ranging(RangeNoise(std=uwb_std, nlos=nlos, nlos_bias=nlos_bias))
-    sensors = [recorded_imu(recording, grid, imu, bias), uwb]
+    sensors = [recorded_imu(recording, grid, imu, euroc_bias(recording)), uwb]
     believed = [imu, Ranging(RangeNoise(std=uwb_std))]
     if landmarks:
         sensors.append(
@@ -167,8 +180,7 @@ def replay_euroc(
             )
         )
         believed.append(Landmarks(landmarks, landmark_std, landmark_radius))
-    # The bias left over: prior and walk wide enough for what the calibration flight cannot know.
-    process = Inertial(0.1, 0.003, accel_walk=0.01, gyro_walk=1e-4) if estimate_bias else Inertial()
+    process = LEFT_OVER if estimate_bias else Inertial()
     return Scenario(
         name="replay-euroc-v0",
         arena=arena_of(recording, grid, margin=1.5),

@@ -4,7 +4,7 @@ from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
 from coloc_env.sensors.clock import Clock
 from coloc_env.sensors.height import Height
-from coloc_env.sensors.imu import GRAVITY, Imu
+from coloc_env.sensors.imu import GRAVITY, Imu, RecordedImu
 from coloc_env.sensors.ins import Ins
 from coloc_env.sensors.landmarks import Landmarks
 from coloc_env.sensors.odometry import Odometry
@@ -31,6 +31,7 @@ __all__ = [
     "RangeNoise",
     "Ranging",
     "Recorded",
+    "RecordedImu",
     "RecordedPoses",
     "Reference",
     "RelativePose",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotation_between, unrotate
-from coloc_env.sensors.base import Layout, Leaf, Sensor, Window, require
+from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window, require
 
 GRAVITY = 9.80665  # m/s², along -z of the world
 
@@ -62,3 +62,15 @@ class Imu(Sensor):
         if "bias" in placed:
             imu.add_(placed["bias"].unsqueeze(1))
         return {"imu": imu.mul_(window.alive.unsqueeze(-1))}
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedImu(Recorded):
+    """A recorded ``Imu`` that also has leaves ``imu_samples`` [S · 6] and ``imu_held`` [S]: each
+    sample in the step that ends now, as it was measured, and for how long it holds (s; 0 where
+    there is none). ``accel_std`` and ``gyro_std`` are those of the mean, as ever."""
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        width = self.tape["imu_held"].values.shape[-1]
+        whole = {"imu_samples": Leaf(6 * width), "imu_held": Leaf(width, 0.0)}
+        return super().leaves(layout) | whole
