@@ -69,7 +69,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
         believed: Believed,
         *,
         particles: int = 20,
-        iterations: int = 4,
+        iterations: int = 3,
         anneal: float = 0.2,
         pace: float = 0.8,
         repulsion: float = 1.0,
