@@ -172,7 +172,9 @@ class SteinViFilter(Localizer[SteinViBelief]):
         key = noise.fold(belief.key, belief.step)
         draws = normal(key, "stein_vi.step", 15, self.particles).double()
         tiny = _NOTHING * torch.eye(9, dtype=added.dtype, device=added.device)
-        jitter = (torch.linalg.cholesky(window.covariance + tiny) @ draws[..., :9, None])[..., 0]
+        jitter = (torch.linalg.cholesky_ex(window.covariance + tiny).L @ draws[..., :9, None])[
+            ..., 0
+        ]
         jitter = torch.where(window.duration.unsqueeze(-1) > 0, jitter, 0.0)
         increments = preintegration.perturb(window.corrected(belief.x[..., 10:]), jitter)
         x = self._moved(belief.x, window, increments)
@@ -231,14 +233,14 @@ class SteinViFilter(Localizer[SteinViBelief]):
         """
         process = self.process
         found = self._sighted(self._block(x, seen), variance.unsqueeze(2))
-        apart = process.boxminus(prior.unsqueeze(2).expand_as(x), x)
+        apart = process.boxminus(prior.unsqueeze(2).expand_as(x), x).contiguous()
         wide = covariance.unsqueeze(2)
         lacking = found.gradient - (found.information @ apart[..., _POSE, None])[..., 0]
         solved = _solved(found.information, wide, lacking.unsqueeze(-1))
         steps = apart + (wide[..., _POSE] @ solved)[..., 0]
-        density = found.log_density - 0.5 * (
-            apart * torch.linalg.solve(wide, apart.unsqueeze(-1))[..., 0]
-        ).sum(-1)
+        density = found.log_density - 0.5 * (apart * _solve(wide, apart.unsqueeze(-1))[..., 0]).sum(
+            -1
+        )
         near = kernel(Se3, _pose_of(x).unsqueeze(2), self._scale(covariance, found))
         attitude = x[..., 6:10]
         pose = steps[..., _POSE]
@@ -246,7 +248,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
         phi = stein_step(near, body, torch.ones_like(body[..., :2]), self.repulsion)[..., 0, :]
         pose = concat((rotate(attitude, phi[..., :3]), phi[..., 3:]))
         inner = covariance[..., _POSE, :][..., _POSE]
-        following = torch.linalg.solve(inner, covariance[..., _POSE, :][..., _REST])
+        following = _solve(inner, covariance[..., _POSE, :][..., _REST])
         alone = apart[..., _REST] - apart[..., _POSE] @ following
         rest = mean_over(near, alone) + pose @ following
         delta = concat((pose[..., :3], rest[..., :3], pose[..., 3:], rest[..., 3:]))
@@ -269,7 +271,13 @@ def _solved(
     """(I + A P_pp)⁻¹ of what stands on the right."""
     inner = covariance[..., _POSE, :][..., _POSE]
     eye = torch.eye(6, dtype=inner.dtype, device=inner.device)
-    return torch.linalg.solve(eye + information @ inner, right)
+    return _solve(eye + information @ inner, right)
+
+
+def _solve(a: Float64[Tensor, "*s e e"], b: Float64[Tensor, "*s e k"]) -> Tensor:
+    """A⁻¹ B; a UAV whose numbers are NaN keeps them, and raises no error for the others."""
+    result: Tensor = torch.linalg.solve_ex(a, b)[0]
+    return result
 
 
 def _pose_of(x: Float64[Tensor, "*s 16"]) -> Float64[Tensor, "*s 7"]:

@@ -32,7 +32,8 @@ def sighted(
     β = ε/(1 − ε) (2π)^{d/2} s^d/V."""
     residual = torch.where(block.mask.unsqueeze(-1), block.residual, 0.0)
     d = residual.shape[-1]
-    beta = share / (1 - share) * (2 * math.pi * variance) ** (0.5 * d) / volume
+    level = share / (1 - share) * (2 * math.pi) ** (0.5 * d) / volume
+    beta = level * variance.sqrt() ** d
     gauss = torch.exp(-0.5 * residual.square().sum(-1) / variance)
     inliers = torch.where(block.mask, gauss / (gauss + beta), 0.0)
     weighted = (inliers / variance)[..., None, None] * block.jacobian

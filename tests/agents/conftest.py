@@ -107,6 +107,7 @@ CHOSEN = {
     "fcmds": ("anchors", "slots"),
     "gn": ("slots",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
+    "stein_vi": ("default", "few", "uniform", "imu_bias", "slots"),
 }
 SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d")
 ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
@@ -169,7 +170,8 @@ def room(name: str, **overrides: Any) -> Scenario:
     that need relative poses."""
     if "stein2d" in CHOSEN.get(name, ()):
         return make_scenario("stein2d-v0", **overrides)
-    among: dict[str, Any] = {"anchors": 8, "landmarks": 0} if name in CHOSEN else {}
+    anchored = "default" not in CHOSEN.get(name, ("default",))
+    among: dict[str, Any] = {"anchors": 8, "landmarks": 0} if anchored else {}
     return make_scenario("indoor-v0", **among, **overrides)
 
 
