@@ -51,7 +51,7 @@ class Watched:
         """Of all times that a wall came between two UAVs which had measured each other before, that
         with the most ranges; None if there is none. Links between anchors do not count."""
         known, apart = np.isfinite(self.range), max(1, round(_APART / self.dt))
-        anchor = np.isnan(self.error).all(0)
+        anchor: Flags = np.asarray(np.isnan(self.error).all(axis=0))
         best, count = None, 0
         for i, j in zip(*np.triu_indices(len(anchor), 1), strict=True):
             steps = np.flatnonzero(
