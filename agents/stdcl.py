@@ -1,5 +1,6 @@
 """ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, sections 4 and 4.2.3)."""
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -24,7 +25,7 @@ from coloc_env.scenario import Believed
 Feedback = Literal["none", "paper", "links", "positions", "learned"]
 _LINKS: tuple[Feedback, ...] = ("paper", "links", "learned")
 _POSITIONS: tuple[Feedback, ...] = ("positions", "learned")
-_RATE = 0.1  # largest change of a link's confidence in a step, as a share
+_RATE = math.log(1.1)  # largest change of a link's confidence in a step, as a logarithm
 _LEAST = 0.1  # confidence of a link
 _REACH = 3.0  # standard deviations
 _GAIN = 0.05  # κ of the paper's feedback

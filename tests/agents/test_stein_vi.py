@@ -1,4 +1,4 @@
-"""The visual-inertial Stein filter: its parts against closed forms and autograd, and its flights."""
+"""The visual-inertial Stein filter: parts against closed forms and autograd, and its flights."""
 
 import math
 import os
