@@ -19,7 +19,7 @@ from agents.particles.belief import normal, own_keys
 from agents.stein import consensus, reckoning
 from agents.stein import window as windows
 from agents.stein.estimate import covariance, map_estimate
-from agents.stein.likelihood import Factors, Fit, Scale, factors, fit, outlier_level
+from agents.stein.likelihood import Factors, Fit, Scale, compare, factors, fit, outlier_level
 from agents.stein.neighbourhood import fit_neighbours
 from agents.stein.reckoning import Moves, Tracks
 from agents.stein.team import RelativeTeam
@@ -166,16 +166,19 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         started = belief.started
         for _ in range(self.iterations):
             x, estimate, edges, started = self._iterated(x, edges, started, now)
-        inliers = fit(poses, estimate.unsqueeze(-2), window, now.known, scale, now.beta).inliers
-        inliers, held = inliers[..., 0], window.held.sum(-1)
+        here = estimate.unsqueeze(-2)
+        inliers = compare(poses, here, window, now.known, scale, now.beta)[1][..., 0]
+        held = window.held.sum(-1)
         share = inliers.sum(-1) / held.clamp_min(1)
         lost = (share < self.restart) & (held >= min(_FEW, self.window))
         lost = lost & (scale.position <= self.matches.std)
-        cloud = lost[..., None, None, None]
+        if bool(lost.any()):
+            fresh = self._anywhere(noise.fold(belief.key, belief.step), origin)
+            x = torch.where(lost[..., None, None, None], fresh, x)
         after = build(
             SteinBelief,
             shape,
-            x=torch.where(cloud, self._anywhere(noise.fold(belief.key, belief.step), origin), x),
+            x=x,
             estimate=estimate,
             edges=edges,
             started=started,
@@ -217,7 +220,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         without noise."""
         poses, n = self.poses, belief.step.shape[1]
         step = moves.step.unsqueeze(2)
-        if self.particles > 1:
+        if self.particles > 1 and any(self.std):
             key = noise.fold(belief.key, belief.step)
             draws = normal(key, "cspf.step", n * poses.dof, self.particles).double()
             draws = draws.unflatten(-1, (n, -1)) * draws.new_tensor(self.std)

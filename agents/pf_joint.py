@@ -11,7 +11,7 @@ from agents.particles.belief import normal, own_keys
 from agents.particles.cloud import effective_sample_size, systematic
 from agents.stein import reckoning
 from agents.stein import window as windows
-from agents.stein.likelihood import Scale, factors, fit, outlier_level
+from agents.stein.likelihood import Scale, compare, factors, outlier_level
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env import noise
@@ -143,7 +143,7 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         window = windows.stored(empty, new)
         beta = outlier_level(poses, scale, self.outliers, self.volume)
         known = factors(poses, window, scale, n)
-        return fit(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta).log_density
+        return compare(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta)[2]
 
     def _moments(
         self, x: Float64[Tensor, "B N m P"], log_weights: Float64[Tensor, "B N m"]

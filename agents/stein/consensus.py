@@ -31,5 +31,6 @@ def agreed(
     rate: float,
 ) -> Float64[Tensor, "B H R N P"]:
     """c_h ← c_h exp(η [log(c_h⁻¹ x̂_h) − ½ log(c_h⁻¹ c_r)])."""
-    change = poses.minus(estimate.unsqueeze(2), own) - 0.5 * poses.minus(told, own)
-    return poses.plus(own, rate * change)
+    toward = torch.stack((estimate.unsqueeze(2).expand_as(told), told))
+    here, there = poses.minus(toward, own).unbind(0)
+    return poses.plus(own, rate * (here - 0.5 * there))

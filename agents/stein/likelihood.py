@@ -73,6 +73,30 @@ def factors(poses: type[Poses], window: Window, scale: Scale, agents: int) -> Fa
     )
 
 
+def compare(
+    poses: type[Poses],
+    x: Float64[Tensor, "B H N m P"],
+    window: Window,
+    known: Factors,
+    scale: Scale,
+    beta: Float64[Tensor, "B H"],
+) -> tuple[Tensor, Float64[Tensor, "B H W m"], Float64[Tensor, "B H m"]]:
+    """A mixture of Gaussian matches and uniform outliers, from the joint residual
+    r = log(T⁻¹ x_i⁻¹ x_j) between a particle's own entries: r [B, H, W, m, D], responsibilities,
+    and the log-density up to a constant."""
+    d = poses.dim
+    between = poses.between(agents_of(x, window.first), agents_of(x, window.second))
+    residual = poses.minus(between, window.pose.unsqueeze(-2))
+    squares = residual.square()
+    one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2) * known.variance
+    distance = squares[..., :d].sum(-1) / one[..., :1] + squares[..., d:].sum(-1) / one[..., 1:]
+    gauss = torch.exp(-0.5 * distance)
+    mixed = gauss + beta[..., None, None]
+    held = window.held.unsqueeze(-1)
+    inliers = torch.where(held, gauss / mixed, 0.0)
+    return residual, inliers, torch.where(held, mixed.log(), 0.0).sum(-2)
+
+
 def fit(
     poses: type[Poses],
     x: Float64[Tensor, "B H N m P"],
@@ -81,25 +105,15 @@ def fit(
     scale: Scale,
     beta: Float64[Tensor, "B H"],
 ) -> Fit:
-    """A mixture of Gaussian matches and uniform outliers, from the joint residual
-    r = log(T⁻¹ x_i⁻¹ x_j) between a particle's own entries.
+    """Where matches would move their ends.
 
     Because J_r(r) r = r, the Gauss–Newton step of one factor needs no solve: it is −r at x_j and
     Ad(T) r at x_i (eq. 17).
     """
     d = poses.dim
-    pose = window.pose.unsqueeze(-2)
-    between = poses.between(agents_of(x, window.first), agents_of(x, window.second))
-    residual = poses.minus(between, pose)
-    squares = residual.square()
-    one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2) * known.variance
-    distance = squares[..., :d].sum(-1) / one[..., :1] + squares[..., d:].sum(-1) / one[..., 1:]
-    gauss = torch.exp(-0.5 * distance)
-    mixed = gauss + beta[..., None, None]
-    held = window.held.unsqueeze(-1)
-    inliers = torch.where(held, gauss / mixed, 0.0)
+    residual, inliers, log_density = compare(poses, x, window, known, scale, beta)
     weighted = inliers.unsqueeze(-1) * residual
-    back = poses.carry(pose, weighted)
+    back = poses.carry(window.pose.unsqueeze(-2), weighted)
     weight, steps = [], []
     for part, cut in enumerate((slice(None, d), slice(d, None))):
         first = known.at_first * known.first[..., part].unsqueeze(-2)
@@ -107,5 +121,4 @@ def fit(
         weight.append((first + second) @ inliers)
         moved = first @ back[..., cut].flatten(-2) - second @ weighted[..., cut].flatten(-2)
         steps.append(moved.unflatten(-1, (x.shape[3], -1)))
-    log_density = torch.where(held, mixed.log(), 0.0).sum(-2)
     return Fit(torch.cat(steps, -1), torch.stack(weight, -1), log_density, inliers)

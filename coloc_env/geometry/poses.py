@@ -36,7 +36,8 @@ class Poses(ABC):
     @classmethod
     def identity(cls, like: Float[Tensor, "*s k"]) -> Float[Tensor, "P"]:
         """The pose at the origin, in the type and on the device of ``like``."""
-        return cls.exp(like.new_zeros(cls.dof))
+        attitude = (1.0, 0.0, 0.0, 0.0) if cls.dim == 3 else (0.0,)
+        return like.new_tensor((*(0.0,) * cls.dim, *attitude))
 
     @staticmethod
     @abstractmethod
