@@ -1,6 +1,7 @@
 """The paper's figure 4 over many runs, and convergence and error against the share of outliers."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -54,5 +55,5 @@ def over_shares(found: Mapping[tuple[int, float], Mapping[str, Runs]]) -> Figure
     return figure
 
 
-def _look(agent: str, index: int) -> dict[str, str]:
+def _look(agent: str, index: int) -> dict[str, Any]:
     return {"label": plan.NAMES.get(agent, agent), "color": _COLOURS[index % len(_COLOURS)]}
