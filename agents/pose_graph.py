@@ -197,6 +197,10 @@ class PoseGraph(RelativeTeam[History]):
         to_now = poses.between(row.track, row.track[:, -1:])  # [N, T, P]: D from then to now
         present = poses.between(to_now[first, at], poses.compose(pose, to_now[second, at]))
         hung = self._layout(first.tolist(), second.tolist(), present, n)
+        if not any(self.std):  # exact odometry makes one unknown of all of a UAV's poses
+            still = [0] * len(pose)
+            ends = first.tolist(), second.tolist()
+            return _Graph(row.track[:, :0], *ends, still, present, hung.unsqueeze(1))
         start = poses.compose(hung.unsqueeze(1), poses.inverse(to_now))
         odometry = poses.between(row.track[:, :-1], row.track[:, 1:])
         return _Graph(odometry, first.tolist(), second.tolist(), at.tolist(), pose, start)
