@@ -7,7 +7,6 @@ Gaussian times a mixture of right and mistaken landmarks.
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import torch
 from jaxtyping import Float64, Int64
@@ -22,7 +21,7 @@ from agents.models.preintegration import Preintegrated
 from agents.models.process import InertialProcess
 from agents.particles.belief import normal, own_keys
 from agents.particles.sampling import from_prior
-from agents.stein.estimate import map_estimate
+from agents.stein.estimate import Manifold, map_estimate
 from agents.stein.landmarks import Sighted, sighted
 from agents.stein.likelihood import Scale
 from agents.stein.update import kernel, mean_over, stein_step
@@ -100,7 +99,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
         self.anneal, self.pace, self.repulsion, self.outliers = anneal, pace, repulsion, outliers
         sides = [b - a for a, b in zip(believed.arena.low, believed.arena.high, strict=True)]
         self.volume = min(math.prod(sides), 4 / 3 * math.pi * landmarks.radius**3)
-        self._states = SimpleNamespace(plus=process.boxplus, minus=process.boxminus)
+        self._states = Manifold(process.boxplus, process.boxminus)
 
     def reset(self, observation: Observation) -> SteinViBelief:
         state, covariance = self.process.initial(observation["prior"].double())

@@ -1,6 +1,7 @@
 """What a holder says: the mean around its best particle, and how well its window determines it."""
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float64
@@ -11,20 +12,15 @@ from agents.stein.window import Window, agents_of
 from coloc_env.geometry import Poses
 
 
-class Manifold(Protocol):
-    """Where means are taken: poses, or whole states."""
+class Manifold(NamedTuple):
+    """``x ⊞ ξ`` and ``y ⊟ x`` of whole states, as ``Poses`` has them of poses."""
 
-    @staticmethod
-    def plus(x: Tensor, xi: Tensor, /) -> Tensor:
-        """``x ⊞ ξ``."""
-
-    @staticmethod
-    def minus(y: Tensor, x: Tensor, /) -> Tensor:
-        """``y ⊟ x``."""
+    plus: Callable[[Tensor, Tensor], Tensor]
+    minus: Callable[[Tensor, Tensor], Tensor]
 
 
 def map_estimate(
-    poses: type[Manifold] | Manifold,
+    poses: type[Poses] | Manifold,
     x: Float64[Tensor, "B H N m P"],
     log_density: Float64[Tensor, "B H m"],
     k: Float64[Tensor, "B H m m"],

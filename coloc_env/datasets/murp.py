@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
-from coloc_env.datasets.recording import Floats, Recording, Table, Track, one_hemisphere
+from coloc_env.datasets.recording import Flags, Floats, Recording, Table, Track, one_hemisphere
 
 SOURCE = (
     "MURP, MIT ACL; Fishberg, Quiter, How, RA-L 2024 (arXiv 2312.17731); "
@@ -59,13 +59,15 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
         raise DataError(f"{folder}: no TRIAL_base-A_targ-B_win-1_step-1.csv of two agents")
     files = {pair: _file(folder, *pair) for pair in permutations(agents, 2)}
     rows = {pair: distinct(read(path, _FORMAT)) for pair, path in files.items()}
-    poses, first = {}, next(iter(rows))
+    first = next(iter(rows))
+    poses: dict[int, Floats] = {}
     for (base, target), each in rows.items():
         path = files[base, target]
         if not np.array_equal(each.time, rows[first].time):
             raise DataError(f"{path}: its stamps are not those of {files[first].name}")
         for agent, pose in ((base, each.values[:, :6]), (target, each.values[:, 6:12])):
-            if (moved := (poses.setdefault(agent, pose) != pose).any(axis=1)).any():
+            moved: Flags = np.not_equal(poses.setdefault(agent, pose), pose).any(axis=1)
+            if moved.any():
                 fail(path, _FORMAT, moved, f"agent {agent} is elsewhere than in another file")
         if (bad := (each.values[:, 12:] < 0).any(axis=1)).any():
             fail(path, _FORMAT, bad, "a range is negative")
