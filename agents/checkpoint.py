@@ -50,10 +50,19 @@ def untrained(kind: type[_L], seed: int, **architecture: Any) -> _L:
 
 
 def learned(kind: type[_L], weights: str, seed: int = 0, **architecture: Any) -> _L:
-    """A neural part with a checkpoint's weights (``load``); untrained for ``none``."""
-    module = untrained(kind, seed, **architecture)
-    if weights != "none":
-        load(weights, module)
+    """A neural part with a checkpoint's weights (``load``) and the architecture of its card;
+    untrained, with the one given, for ``none``."""
+    if weights == "none":
+        return untrained(kind, seed, **architecture)
+    card = card_of(weights)
+    own = card.get("architecture", {}) if card["kind"] == kind.kind else {}
+    try:
+        module = untrained(kind, seed, **{**architecture, **own})
+    except TypeError:
+        raise ValueError(
+            f"{weights}: its card has an architecture that no {kind.kind} has"
+        ) from None
+    load(weights, module)
     return module
 
 

@@ -153,6 +153,8 @@ def stdcl(
     variants: str = "/".join(VARIANTS),
     agent: str = "stdcl",
     start: str = "none",
+    kernel: int = 3,
+    convolutions: bool = True,
     worlds: int = 4,
     epochs: int = 10,
     steps: int = 10,
@@ -168,13 +170,14 @@ def stdcl(
     In each of ``epochs`` epochs ``worlds`` new worlds of every one of ``variants`` (overrides of
     ``scenario``, separated by slashes) are flown by ``agent`` (``stdcl`` with any options but
     weights, or ``stgat``) with its newest weights; every ``steps`` steps the loss is backpropagated
-    through them. ``start``: weights to begin with, a checkpoint's name or path.
+    through them. ``start``: weights to begin with, a checkpoint's name or path; else the network
+    is a new one with this ``kernel`` in time, or without ``convolutions``.
     From the share ``smooth_from`` of the epochs on it contains the trajectory's second difference.
     The learning rate falls from ``learning_rate`` to ``last_rate`` along a cosine. ``augment``: the
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
     are compared at the end.
     """
-    at_least("stdcl", 1, worlds=worlds, epochs=epochs, steps=steps)
+    at_least("stdcl", 1, worlds=worlds, epochs=epochs, steps=steps, kernel=kernel)
     at_least("stdcl", 0, score_runs=score_runs, seed=seed)
     positive("stdcl", learning_rate=learning_rate, last_rate=last_rate)
     shares("stdcl", smooth_from=smooth_from)
@@ -183,7 +186,9 @@ def stdcl(
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
     agent = f"{agent}:weights=none"
-    network = learned(StGnn, start, seed, kinematic=name == "stdcl")
+    network = learned(
+        StGnn, start, seed, kernel=kernel, temporal=convolutions, kinematic=name == "stdcl"
+    )
     loops: list[Any] = [make(agent, scene) for scene in scenes]
     for one in loops:
         one.learn(network)

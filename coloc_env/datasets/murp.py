@@ -66,7 +66,7 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
         if not np.array_equal(each.time, rows[first].time):
             raise DataError(f"{path}: its stamps are not those of {files[first].name}")
         for agent, pose in ((base, each.values[:, :6]), (target, each.values[:, 6:12])):
-            moved: Flags = np.not_equal(poses.setdefault(agent, pose), pose).any(axis=1)
+            moved: Flags = np.any(poses.setdefault(agent, pose) != pose, axis=1)
             if moved.any():
                 fail(path, _FORMAT, moved, f"agent {agent} is elsewhere than in another file")
         if (bad := (each.values[:, 12:] < 0).any(axis=1)).any():
