@@ -69,7 +69,8 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
             moved: Flags = np.any(poses.setdefault(agent, pose) != pose, axis=1)
             if moved.any():
                 fail(path, _FORMAT, moved, f"agent {agent} is elsewhere than in another file")
-        if (bad := (each.values[:, 12:] < 0).any(axis=1)).any():
+        bad: Flags = np.any(each.values[:, 12:] < 0, axis=1)
+        if bad.any():
             fail(path, _FORMAT, bad, "a range is negative")
     time = rows[first].time
     angle = np.deg2rad(30 + 60 * np.arange(ANTENNAS))
