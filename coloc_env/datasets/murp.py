@@ -66,10 +66,11 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
         if not np.array_equal(each.time, rows[first].time):
             raise DataError(f"{path}: its stamps are not those of {files[first].name}")
         for agent, pose in ((base, each.values[:, :6]), (target, each.values[:, 6:12])):
-            moved: Flags = np.any(poses.setdefault(agent, pose) != pose, axis=1)
+            apart = np.not_equal(poses.setdefault(agent, pose), pose)
+            moved: Flags = np.logical_or.reduce(apart, axis=1)
             if moved.any():
                 fail(path, _FORMAT, moved, f"agent {agent} is elsewhere than in another file")
-        bad: Flags = np.any(each.values[:, 12:] < 0, axis=1)
+        bad: Flags = np.logical_or.reduce(each.values[:, 12:] < 0, axis=1)
         if bad.any():
             fail(path, _FORMAT, bad, "a range is negative")
     time = rows[first].time
