@@ -39,15 +39,14 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
     files: those of NOTES.md, fitted to the true distances of its ranges, hold for all agents
     (antenna i at 0.32 m and 30 + 60 (i − 1) degrees in the body's xy plane). Stream: uav_ranges;
     the table of an agent holds what it measured as base, since A → B and B → A are two
-    measurements. A field without a number (5 in trial 16) is a range that was not measured; a range
-    of 0 (5 in trial 14, all of antennas within 0.22 m) is what the radio says there.
+    measurements. A field without a number (one in trial 16) is a range that was not measured; a
+    range of 0 (5 in trial 14, where the antennas were within 0.22 m) stands as it is.
 
     Measured on trials 09, 14 and 16, range minus truth: agents 2 and 3 are -0.11 to -0.14 m off
-    (median; robust deviation 0.07 m), agent 1 and either +0.03 to +0.12 m (0.09 to 0.14 m, up to
-    8 m, where a body is between the antennas). Agents turn by up to 87 degrees and move by up to
-    0.6 m within a window, and a mean range is not the range of the mean pose: those two differ by
-    up to 0.1 m. The relative poses in the files are means, too, and differ from those of the mean
-    poses by up to 0.5 m and 1 degree; they are not used.
+    (median; robust deviation 0.07 m), agent 1 and either +0.03 to +0.12 m (0.09 to 0.14 m, at most
+    8 m). From one second to the next agents turn by up to 87 degrees and move by up to 0.49 m; the
+    true ranges in the files are those of the mean poses within 0.03 m. The relative poses in the
+    files are not (they differ by up to 0.5 m and 1 degree), and are not used.
 
     Raises:
         DataError: a file is missing or damaged, files differ in their stamps, or in an agent's
