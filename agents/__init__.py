@@ -14,6 +14,7 @@ from agents import pf as _pf  # noqa: F401
 from agents import pf_joint as _pf_joint  # noqa: F401
 from agents import pfnn as _pfnn  # noqa: F401
 from agents import pose_graph as _pose_graph  # noqa: F401
+from agents import stdcl as _stdcl  # noqa: F401
 from agents import stein_vi as _stein_vi  # noqa: F401
 from agents import team_map as _team_map  # noqa: F401
 from agents import trusting as _trusting  # noqa: F401

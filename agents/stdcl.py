@@ -17,7 +17,6 @@ from agents.stgnn.network import Correction, Past, StGnn
 from agents.swarm import joint
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
 from agents.swarm.links import along_links, lengths
-from agents.team_map import RecursiveMap
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -160,8 +159,8 @@ class StDcl(NetworkLoop):
     """ST-DCL whole: ``dwmds_st``, the ST-GNN, and the loop between them.
 
     ``feedback``: ``learned`` (what the shipped weights were trained with), ``paper`` (equation 36),
-    ``none``, ``links``, ``positions``. ``optimizer``: what the network corrects, and its
-    ``confidence``. ``weights``: a checkpoint's name or path, or ``none``.
+    ``none``, ``links``, ``positions``. ``confidence``: the optimizer's. ``weights``: a
+    checkpoint's name or path, or ``none``.
     """
 
     name = "stdcl"
@@ -173,11 +172,8 @@ class StDcl(NetworkLoop):
         weights: str = "stdcl",
         feedback: Feedback = "learned",
         confidence: Confidence = "em",
-        optimizer: Literal["dwmds_st", "map"] = "dwmds_st",
     ) -> None:
-        base = (DynamicMds if optimizer == "dwmds_st" else RecursiveMap)(
-            believed, confidence=confidence
-        )
+        base = DynamicMds(believed, confidence=confidence)
         super().__init__(base, learned(StGnn, weights), feedback)
 
 

@@ -106,6 +106,8 @@ CHOSEN = {
     **dict.fromkeys(("mds", "dwmds", "vmds"), ("nlos", "anchors", "slots")),
     "fcmds": ("anchors", "slots"),
     "gn": ("slots",),
+    "stdcl": ("anchors", "slots", "swarm", "campus"),
+    "stgat": ("slots", "swarm"),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
     "stein_vi": ("default", "few", "uniform", "imu_bias", "slots"),
 }
