@@ -4,6 +4,7 @@ The team's stress is minimized by majorization, warm-started where dead reckonin
 UAV. The paper's window of past ranges is folded into a recursive prior with a joint covariance.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import register
-from agents.swarm import joint
+from agents.swarm import joint, window
 from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
 from agents.swarm.majorization import pull, require_iterations
 from coloc_env.scenario import Believed
@@ -47,6 +48,8 @@ class DynamicMds(SwarmFilter):
         bias: bool = True,
         prior: bool = True,
         v_max: float | None = None,
+        window: int = 0,
+        decay: float = 0.05,
         iterations: int = 5,
         first: int = 60,
     ) -> None:
@@ -54,7 +57,12 @@ class DynamicMds(SwarmFilter):
         require_iterations(iterations, first)
         if v_max is not None and not v_max > 0:
             raise ValueError(f"v_max={v_max} is not allowed: a speed in m/s > 0")
+        if window < 0:
+            raise ValueError(f"window={window} is not allowed: a number of steps ≥ 0")
+        if not 0 <= decay < math.inf:
+            raise ValueError(f"decay={decay} is not allowed: a rate in 1/s ≥ 0")
         self.prior, self.iterations, self.first, self.v_max = prior, iterations, first, v_max
+        self.window, self.decay = window, decay
 
     def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
         return joint.independent(variance, 1)
@@ -63,7 +71,12 @@ class DynamicMds(SwarmFilter):
         """Algorithm 1's inner loop, and the covariance of what it finds."""
         begins = (belief.step == 0).any(-1)[:, None, None]
         index = joint.moving(now.fixed)
-        trust = self.trust(now, index)
+        place, known = (now.place, now.joint) if now.past is None else window.before(now.past)
+        trust = self.trust(known, now.fixed, index)
+        holds = informs = trust
+        if now.past is not None:
+            holds = trust + joint.laplacian(now.past.weight.sum(2), index)
+            informs = trust + joint.laplacian(now.past.told.sum(2) / self.process.dim, index)
         still, distance = now.fixed.unsqueeze(-1), now.links.distance
         y, at, factor = now.place, now, trust
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
@@ -71,29 +84,41 @@ class DynamicMds(SwarmFilter):
             goes_on = begins | (k < self.iterations)  # a world that is not new stops earlier
             if k in _REFRESH or k % _SELDOM == 0:
                 if k == _REFRESH[-1] and bool(begins.any()):
-                    at = self.nearer(weight, trust, now, begins)
+                    at = self.nearer(weight, informs, now, begins)
                 weight, shift = (
                     torch.where(goes_on, new, old)
                     for new, old in zip(self.weigh(y, at), (weight, shift), strict=True)
                 )
                 links = joint.laplacian(weight, index)
-                factor = torch.linalg.cholesky_ex(joint.held(links + trust, now.fixed[:, index])).L
-            down = torch.where(still, 0.0, pull(y, distance - shift, weight))[:, index]
-            down = down + trust @ (now.place - y)[:, index]
+                factor = torch.linalg.cholesky_ex(joint.held(links + holds, now.fixed[:, index])).L
+            down = pull(y, distance - shift, weight)
+            if now.past is not None:
+                down = down + window.pull(y, now.past)
+            down = torch.where(still, 0.0, down)[:, index]
+            down = down + trust @ (place - y)[:, index]
             step = _RELAXED * torch.cholesky_solve(down, factor)
             y = torch.where(goes_on, y.index_add(1, index, step), y)
         if self.v_max is not None:
             y = self.slowed(belief, now, y)
-        weight, _ = self.weigh(y, at)
-        together = self.known(weight, trust, now, index)
+        weight, shift = self.weigh(y, at)
+        together = self.known(weight, informs, now, index)
         variance = own_blocks(together).diagonal(dim1=-2, dim2=-1).mean(-1)
-        return Found(y, variance, together)
+        past = now.past
+        if past is not None:
+            told = self.told(weight, now)
+            past = window.pushed(past, now.place, now.joint, distance - shift, weight, told)
+        return Found(y, variance, together, past)
 
-    def trust(self, now: Prepared, index: Int64[Tensor, "M"]) -> Float64[Tensor, "B L L"]:
+    def trust(
+        self,
+        known: Float64[Tensor, "B N e K"],
+        fixed: Bool[Tensor, "B N"],
+        index: Int64[Tensor, "M"],
+    ) -> Float64[Tensor, "B L L"]:
         """What dead reckoning is worth (1/m²) to those in ``index``."""
         if self.prior:
-            return joint.precision(joint.among(now.joint, index), now.fixed[:, index])
-        forgotten = torch.where(now.fixed, 0.0, _FORGOTTEN)[:, index]
+            return joint.precision(joint.among(known, index), fixed[:, index])
+        forgotten = torch.where(fixed, 0.0, _FORGOTTEN)[:, index]
         return torch.diag_embed(forgotten)
 
     def known(

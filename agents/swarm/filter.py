@@ -12,9 +12,10 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
-from agents.swarm import calibration, drift, joint, persistence, weights
+from agents.swarm import calibration, drift, joint, persistence, weights, window
 from agents.swarm.drift import Drift
 from agents.swarm.links import Links, connected, lengths, links_of
+from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
@@ -32,7 +33,8 @@ class SwarmBelief(TensorClass):
     steps taken; and, the same for all, what is remembered of ranges' errors and of how links change
     between clean and obstructed; of each link how likely it is obstructed (``paper``: how often it
     was silent; none where that is not used); whether the UAV is ``localizable``: connected to so
-    many with fixes that they settle a position, d + 1. Batch (B, N)."""
+    many with fixes that they settle a position, d + 1; the ``past`` steps of a sliding window (none
+    where there is no such). Batch (B, N)."""
 
     state: Float64[Tensor, "B N S"]
     variance: Float64[Tensor, "B N"]
@@ -44,6 +46,7 @@ class SwarmBelief(TensorClass):
     chain: Float64[Tensor, "B N 2 2"]
     memory: Float64[Tensor, "B N L"]
     localizable: Bool[Tensor, "B N"]
+    past: History
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Prepared:
     not estimated), how links change (``chain``), the probability that each is an ``outlier``
     beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
     and by what factor each link's weight is held down from outside (``confidence``, in [0, 1];
-    None: not at all)."""
+    None: not at all); the ``past`` steps as they look from now (None: no window)."""
 
     state: Float64[Tensor, "B N S"]
     place: Float64[Tensor, "B N d"]
@@ -73,15 +76,18 @@ class Prepared:
     outlier: Float64[Tensor, "B N N"] | None = None
     silent: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
+    past: History | None = None
 
 
 @dataclass(frozen=True)
 class Found:
-    """Positions (m), their variance (m² per axis), and the joint covariance if there is one."""
+    """Positions (m), their variance (m² per axis), the joint covariance if there is one, and the
+    window of steps with this one in it (None: as it was)."""
 
     position: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"] | None = None
+    past: History | None = None
 
 
 class SwarmFilter(Localizer[SwarmBelief]):
@@ -92,6 +98,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
+    window = 0  # steps that are remembered besides the present one
+    decay = 0.0  # 1/s: at what rate they fade
 
     def __init__(self, believed: Believed, confidence: Confidence, bias: bool = False) -> None:
         """``bias``: estimate the INS's, where the team has one that it believes to be biased."""
@@ -122,10 +130,11 @@ class SwarmFilter(Localizer[SwarmBelief]):
         usual = model.share[:, 1, None, None] if self.confidence == "em" else 0.0
         drifting = 0.0 if self.ins is None else self.ins.bias**2
         none = torch.zeros_like(variance)
+        known = self.joint(variance)
         return SwarmBelief(
             state=state,
             variance=variance,
-            joint=self.joint(variance),
+            joint=known,
             bias=torch.zeros_like(state[..., :d]),
             drift=torch.stack((none, none + drifting), -1),
             step=torch.zeros(shape, dtype=torch.int64, device=state.device),
@@ -133,6 +142,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             chain=_for_each(chain, shape),
             memory=variance.new_zeros(*shape, width) + usual,
             localizable=torch.zeros(shape, dtype=torch.bool, device=state.device),
+            past=window.begun(state[..., :d], known, self.window),
             batch_size=shape,
         )
 
@@ -180,6 +190,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             between,
             moving,
             belief.chain[:, 0],
+            past=self._past(belief, place, kept, added, fixed, spread, dt),
         )
         if self.confidence == "em":
             return self._learned(belief, now)
@@ -218,6 +229,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             chain=_for_each(now.chain, shape),
             memory=self._remembered(belief, now, found),
             localizable=_localizable(now, d),
+            past=belief.past if found.past is None else found.past,
         )
         estimate = build(
             Estimate,
@@ -289,6 +301,27 @@ class SwarmFilter(Localizer[SwarmBelief]):
         fixed = observation["position_fix_mask"][..., 0] > 0
         known = observation["position_fix"].double()
         return fixed, torch.where(fixed.unsqueeze(-1), known, position), sensor.std**2
+
+    def _past(
+        self,
+        belief: SwarmBelief,
+        place: Float64[Tensor, "B N d"],
+        kept: Float64[Tensor, "B N"],
+        added: Float64[Tensor, "B N"],
+        fixed: Bool[Tensor, "B N"],
+        spread: float,
+        dt: Float64[Tensor, "B N"],
+    ) -> History | None:
+        """The window as it looks from now."""
+        if not self.window:
+            return None
+        return window.carried(
+            belief.past,
+            place - belief.state[..., : self.process.dim],
+            kept.masked_fill(fixed, 0.0),
+            added.masked_fill(fixed, spread),
+            window.fading(self.decay, dt),
+        )
 
     def _learned(self, belief: SwarmBelief, now: Prepared) -> Prepared:
         """The same with the error model after this step's links between those who know where they

@@ -16,7 +16,7 @@ from training.metrics import rmse
 
 SMALL: dict[str, Any] = {"n_uavs": 40, "anchors": 0.25, "ins_bias": 0.0, "horizon": 25}
 PAPERS = "dwmds_st:confidence=paper:v_max=50"
-METHODS = ("dwmds_st", PAPERS, "gn", "map", "mds")
+METHODS = ("dwmds_st", "dwmds_st:window=3", PAPERS, "gn", "map", "mds")
 
 
 def flown(agent: str, seeds: Tensor, steps: int = 8, **overrides: Any) -> list[Tensor]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from agents import make
 from agents.fc_mds import completed
+from agents.swarm import window
 from agents.swarm.calibration import believed_model
 from agents.swarm.filter import Prepared, SwarmBelief, SwarmFilter, begun
 from agents.swarm.gauss_newton import fisher
@@ -87,6 +88,7 @@ def belief(now: Prepared, step: int = 1) -> SwarmBelief:
         localizable=now.fixed,
         step=torch.full(shape, step),
         errors=now.model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
+        past=window.begun(now.place, now.joint, 0),
         batch_size=shape,
     )
 
