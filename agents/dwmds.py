@@ -36,6 +36,11 @@ class DynamicMds(SwarmFilter):
     what the paper detects), or ``none`` (all alike). ``bias=false`` does not estimate the INS's.
     ``prior=false`` forgets dead reckoning once it has been started from. ``v_max`` (m/s): no UAV is
     said to be faster (the paper's projection). ``iterations`` a step, ``first`` in the first.
+
+    ``window``: the stress sums over the links of as many past steps, too, each where dead reckoning
+    says it was, with weights exp(−λ age), λ the ``decay`` in 1/s; the prior is then what was known
+    before the oldest of them. The paper's T is min(T_max, ⌈√(2R/a_max)/Δt⌉), R the radius of
+    communication. Displacements are held to be exact, their errors are what ``decay`` stands for.
     """
 
     name = "dwmds_st"
@@ -118,8 +123,7 @@ class DynamicMds(SwarmFilter):
         """What dead reckoning is worth (1/m²) to those in ``index``."""
         if self.prior:
             return joint.precision(joint.among(known, index), fixed[:, index])
-        forgotten = torch.where(fixed, 0.0, _FORGOTTEN)[:, index]
-        return torch.diag_embed(forgotten)
+        return torch.diag_embed(_FORGOTTEN * (~fixed[:, index]).double())
 
     def known(
         self,
