@@ -1,7 +1,8 @@
 """DW-MDS: dynamically weighted multidimensional scaling of a swarm (ST-DCL paper, Algorithm 1).
 
 The team's stress is minimized by majorization, warm-started where dead reckoning has carried each
-UAV. The paper's window of past ranges is folded into a recursive prior with a joint covariance.
+UAV. The paper's window of past ranges is folded into a recursive prior with a joint covariance,
+or kept as it is (``window``).
 """
 
 import math
