@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from agents.stein.frames import adjoint, seen_from
 from agents.stein.window import Window, agents_of
 from coloc_env.geometry import Poses
 
@@ -33,14 +34,21 @@ class Fit:
 
 @dataclass(frozen=True)
 class Factors:
-    """The window as factors, prepared once a step: who is at their ends (0 or 1), variances over
-    those of the scale (position, turn), and the weights of their steps at either end."""
+    """The window as factors, prepared once a step, so that iterations are products of matrices.
+
+    Who is at their ends (0 or 1), variances over those of the scale (of position and turn),
+    ``seen`` and ``offset``: y ↦ T⁻¹ y of the numbers stored for a pose, ``gather``: from factors'
+    residuals to the sum of their steps at each agent, ``weigh``: from their responsibilities to the
+    sum of weights.
+    """
 
     at_first: Float64[Tensor, "B H N W"]
     at_second: Float64[Tensor, "B H N W"]
     variance: Float64[Tensor, "B H W 2"]
-    first: Float64[Tensor, "B H W 2"]
-    second: Float64[Tensor, "B H W 2"]
+    seen: Float64[Tensor, "B H W P P"]
+    offset: Float64[Tensor, "B H W P"]
+    gather: Float64[Tensor, "B H N*D W*D"]
+    weigh: Float64[Tensor, "B H N*2 W"]
 
 
 def outlier_level(
@@ -64,13 +72,36 @@ def factors(poses: type[Poses], window: Window, scale: Scale, agents: int) -> Fa
     position, turn = variance.unbind(-1)
     lever = poses.split(window.pose)[0].square().sum(-1) * one[..., 1] / one[..., 0]
     index = torch.arange(agents, device=position.device).unsqueeze(-1)
+    at_first = (window.first.unsqueeze(-2) == index).to(position.dtype)
+    at_second = (window.second.unsqueeze(-2) == index).to(position.dtype)
+    first = torch.stack((1 / (position + lever * turn), 1 / turn), -2)
+    first = at_first.unsqueeze(3) * first.unsqueeze(2)  # [B, H, N, 2, W]
+    second = at_second.unsqueeze(3) / variance.mT.unsqueeze(2)
+    rotation, seen, offset = seen_from(poses, window.pose)
     return Factors(
-        at_first=(window.first.unsqueeze(-2) == index).to(position.dtype),
-        at_second=(window.second.unsqueeze(-2) == index).to(position.dtype),
+        at_first=at_first,
+        at_second=at_second,
         variance=variance,
-        first=torch.stack((1 / (position + lever * turn), 1 / turn), -1),
-        second=1 / variance,
+        seen=seen,
+        offset=offset,
+        gather=_gather(window.pose, rotation, first, second),
+        weigh=(first + second).flatten(2, 3),
     )
+
+
+def _gather(
+    pose: Float64[Tensor, "B H W P"],
+    rotation: Float64[Tensor, "B H W d d"],
+    first: Float64[Tensor, "B H N 2 W"],
+    second: Float64[Tensor, "B H N 2 W"],
+) -> Float64[Tensor, "B H N*D W*D"]:
+    """Ad(T) r at first ends, −r at second ones, each with its weight."""
+    back = adjoint(pose, rotation)
+    d, dof = rotation.shape[-1], back.shape[-1]
+    part = (torch.arange(dof, device=back.device) >= d).long()
+    eye = torch.eye(dof, dtype=back.dtype, device=back.device).unsqueeze(1)
+    first, second = (each[:, :, :, part].unsqueeze(-1) for each in (first, second))
+    return (first * back.transpose(2, 3).unsqueeze(2) - second * eye).flatten(4).flatten(2, 3)
 
 
 def compare(
@@ -86,7 +117,8 @@ def compare(
     and the log-density up to a constant."""
     d = poses.dim
     between = poses.between(agents_of(x, window.first), agents_of(x, window.second))
-    residual = poses.minus(between, window.pose.unsqueeze(-2))
+    there = known.seen @ between.mT + known.offset.unsqueeze(-1)
+    residual = poses.log(there.mT)
     squares = residual.square()
     one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2) * known.variance
     distance = squares[..., :d].sum(-1) / one[..., :1] + squares[..., d:].sum(-1) / one[..., 1:]
@@ -110,15 +142,8 @@ def fit(
     Because J_r(r) r = r, the Gauss–Newton step of one factor needs no solve: it is −r at x_j and
     Ad(T) r at x_i (eq. 17).
     """
-    d = poses.dim
     residual, inliers, log_density = compare(poses, x, window, known, scale, beta)
-    weighted = inliers.unsqueeze(-1) * residual
-    back = poses.carry(window.pose.unsqueeze(-2), weighted)
-    weight, steps = [], []
-    for part, cut in enumerate((slice(None, d), slice(d, None))):
-        first = known.at_first * known.first[..., part].unsqueeze(-2)
-        second = known.at_second * known.second[..., part].unsqueeze(-2)
-        weight.append((first + second) @ inliers)
-        moved = first @ back[..., cut].flatten(-2) - second @ weighted[..., cut].flatten(-2)
-        steps.append(moved.unflatten(-1, (x.shape[3], -1)))
-    return Fit(torch.cat(steps, -1), torch.stack(weight, -1), log_density, inliers)
+    weighted = (inliers.unsqueeze(-1) * residual).mT.flatten(2, 3)
+    steps = (known.gather @ weighted).unflatten(2, (-1, poses.dof)).mT
+    weight = (known.weigh @ inliers).unflatten(2, (-1, 2)).mT
+    return Fit(steps, weight, log_density, inliers)
