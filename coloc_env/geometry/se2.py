@@ -86,8 +86,9 @@ class Se2(Poses):
 
 def _arc(angle: Float[Tensor, "*s"]) -> tuple[Tensor, Tensor]:
     """``sin θ / θ`` and ``(1 − cos θ)/θ``: where a unit path that turns by θ leads."""
-    first, second = stumpff(angle * angle, (1, 2))
-    return first, angle * second
+    half = 0.5 * angle
+    (chord,) = stumpff(half * half, (1,))
+    return chord * half.cos(), chord * half.sin()
 
 
 def _chord(angle: Float[Tensor, "*s"]) -> tuple[Tensor, Tensor]:

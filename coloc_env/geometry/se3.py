@@ -11,8 +11,8 @@ from coloc_env.geometry.rotations import (
     concat,
     cross,
     cross_matrix,
+    join,
     quaternion_conjugate,
-    quaternion_exp,
     quaternion_log,
     quaternion_product,
     rotate,
@@ -32,21 +32,48 @@ class Se3(Poses):
 
     @staticmethod
     def exp(xi: Float[Tensor, "*s 6"]) -> Float[Tensor, "*s 7"]:
-        """Tangent vector to pose: the position is ``ρ + c₂ φ × ρ + c₃ φ × (φ × ρ)``."""
-        rho, phi = xi[..., :3], xi[..., 3:]
-        second, third = stumpff(so3.squared_angle(phi), (2, 3))
-        once = cross(phi, rho)
-        twice = cross(phi, once)
-        position = rho + second.unsqueeze(-1) * once + third.unsqueeze(-1) * twice
-        return concat((position, quaternion_exp(phi)))
+        """Tangent vector to pose: the position is ``c₁ ρ + c₂ φ × ρ + c₃ (φ·ρ) φ``."""
+        u, v, w, x, y, z = xi.unbind(-1)
+        squared = x * x + y * y + z * z
+        (third,) = stumpff(squared, (3,))
+        first = 1 - squared * third
+        angle = (squared + torch.finfo(xi.dtype).tiny).sqrt()
+        half = 0.5 * angle
+        sine = half.sin() / angle
+        second = 2 * sine * sine
+        along = third * (x * u + y * v + z * w)
+        return join(
+            (
+                first * u + second * (y * w - z * v) + along * x,
+                first * v + second * (z * u - x * w) + along * y,
+                first * w + second * (x * v - y * u) + along * z,
+                half.cos(),
+                sine * x,
+                sine * y,
+                sine * z,
+            )
+        )
 
     @staticmethod
     def log(x: Float[Tensor, "*s 7"]) -> Float[Tensor, "*s 6"]:
-        """Pose to the tangent vector of angle at most π."""
-        position, phi = x[..., :3], quaternion_log(x[..., 3:])
-        quadratic = inverse_coefficient(so3.squared_angle(phi)).unsqueeze(-1)
-        once = cross(phi, position)
-        return concat((position - 0.5 * once + quadratic * cross(phi, once), phi))
+        """Pose to the tangent vector of angle at most π: with ``c`` the coefficient of the inverse
+        Jacobian, ρ is ``(1 − c θ²) t − ½ φ × t + c (φ·t) φ``."""
+        half = 0.5 * quaternion_log(x[..., 3:])
+        (px, py, pz), (a, b, c) = x[..., :3].unbind(-1), half.unbind(-1)
+        squared = 4 * (a * a + b * b + c * c)
+        quadratic = inverse_coefficient(squared)
+        across = 1 - squared * quadratic
+        along = 4 * quadratic * (a * px + b * py + c * pz)
+        return join(
+            (
+                across * px - (b * pz - c * py) + along * a,
+                across * py - (c * px - a * pz) + along * b,
+                across * pz - (a * py - b * px) + along * c,
+                2 * a,
+                2 * b,
+                2 * c,
+            )
+        )
 
     @staticmethod
     def compose(a: Float[Tensor, "*s 7"], b: Float[Tensor, "*s 7"]) -> Float[Tensor, "*s 7"]:
