@@ -117,7 +117,8 @@ class SteinFilter(RelativeTeam[SteinBelief]):
                 raise ValueError(f"{key}={size} is not allowed: a number ≥ 0")
         self.particles, self.iterations, self.seed = particles, iterations, seed
         self.window = self.matches.matches if literal else window
-        self.gamma, self.repulsion, self.pace = gamma, repulsion, pace
+        self.gamma, self.pace = gamma, pace
+        self.repulsion = repulsion if particles > 1 else 0.0  # of itself, by rounding: up to 1e-5 m
         self.eta = -eta if variant == "paper" else eta
         self.restart = 0.0 if literal else restart
         self.consensus, self.broadcast = consensus, broadcast

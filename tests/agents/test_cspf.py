@@ -51,6 +51,7 @@ def test_a_plain_bootstrap_filter_does_not() -> None:
     assert converged("stein2d-v0", "pf_joint", 6, 130).sum() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["paper", "paper_corrected"])
 def test_the_paper_as_printed_does_not(variant: str) -> None:
     assert converged("stein2d-v0", f"cspf:variant={variant}:particles=20", 6, 90).sum() == 0

@@ -211,6 +211,7 @@ def test_a_second_of_samples_is_more_than_their_mean() -> None:
     assert off[1].median() > 3 * off[0].median()
 
 
+@pytest.mark.slow
 def test_false_matches_hurt_no_more_than_without() -> None:
     """Against the plain EKF, which believes them, and the gated one, which is as good."""
     made = euroc(span=(0.0, 15.0), false_matches=0.1)
