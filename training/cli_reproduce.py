@@ -46,7 +46,7 @@ _PARTS = {
     Paper.pfnn: (Part.paper, Part.robustness, Part.all),
     Paper.nnhpff: (Part.paper, Part.robustness, Part.all),
     Paper.stdcl: (Part.paper, Part.stress, Part.learned, Part.campus, Part.real, Part.all),
-    Paper.cspf: (Part.paper, Part.robustness, Part.all),
+    Paper.cspf: (Part.paper, Part.robustness, Part.real, Part.all),
     Paper.marl: (Part.all,),
 }
 
@@ -61,7 +61,7 @@ def reproduce(
         Part,
         typer.Option(
             help="The paper's own tables and figures, the study beyond (of **stdcl**: stress, the "
-            "learned part, campus flights, recordings), or all."
+            "learned part, campus flights, recordings; of **cspf**: recordings), or all."
         ),
     ] = Part.all,
     runs: Annotated[

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from training.reproduce.cspf import plan
+from training.reproduce.cspf import plan, real
 from training.reproduce.cspf.claims import verdicts
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.cspf.run import NAMES, reproduce
-from training.reproduce.study import Variant
+from training.reproduce.study import WORLD, Variant
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN
 
 RUNS = 100
@@ -28,6 +28,7 @@ def made_up(share: float, worst: float, steps: int = plan.LATE) -> Runs:
         broken=np.zeros(RUNS, bool),
         error=error,
         nees=np.full_like(error, 2.0),
+        ms_per_step=1.0,
     )
     results = SimpleNamespace(agents={"x": one}, scored=np.ones_like(error, bool), runs=RUNS)
     return Runs(results, "x")  # type: ignore[arg-type]
@@ -84,6 +85,27 @@ def test_every_world_can_be_built_and_has_a_key_of_its_own() -> None:
         assert variant.build().horizon == 9
         assert 1 <= plan.runs_in(variant, 10) <= 10
     assert plan.runs_in(Variant("x", "x", (("n_uavs", 20),)), 100) == 20
+
+
+def test_claims_about_recordings_follow_the_runs() -> None:
+    rng = np.random.default_rng(0)
+
+    def some(size: float) -> Runs:
+        runs = made_up(1.0, size)
+        runs.one.error *= rng.uniform(0.9, 1.1, (RUNS, 1, 1))
+        return runs
+
+    better, worse = ("stein_vi", real.TEAM[0]), (WORLD, "stein_vi:particles=1", *real.TEAM[1:])
+    for good, verdict in ((True, REPRODUCED), (False, CONTRADICTED)):
+        near, far = (0.1, 0.5) if good else (0.5, 0.1)
+        there = {a: some(near) for a in better} | {a: some(far) for a in worse}
+        found = {variant.key: there for variant, _ in real.planned(None)}
+        judged = real.verdicts(found, None)
+        assert {v.verdict for v in judged} == {verdict}
+    assert {v.verdict for v in real.verdicts({}, None)} == {UNKNOWN}
+    assert len({v.key for v, _ in real.planned(None)}) == len(real.planned(None))
+    header, lines = real.table({"x": {a: some(0.1) for a in better}})
+    assert all(len(line) == len(header) for line in lines)
 
 
 def quiet(*_: object) -> None:

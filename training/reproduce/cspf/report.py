@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from training.reproduce import drawing, reporting, verdicts
-from training.reproduce.cspf import figures, plan, tables
+from training.reproduce.cspf import figures, plan, real, tables
 from training.reproduce.cspf.claims import verdicts as judge
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.reporting import Text
@@ -21,7 +21,7 @@ def runs_of(study: Study, variant: Variant, agents: Sequence[str], count: int) -
     """Those that were flown, by agent; none where the worlds are not there."""
     if not study.can(variant):
         return {}
-    results = study.results(variant, [WORLD, *agents], count)
+    results = study.results(variant, list(dict.fromkeys((WORLD, *agents))), count)
     return {a: Runs(results, a) for a in agents if a in results.agents}
 
 
@@ -94,6 +94,15 @@ def beyond_part(study: Study, runs: int, steps: int | None) -> Text:
         found = {v.title: runs_of(study, v, a, plan.runs_in(v, runs)) for v, a in planned}
         text += titled_table(title, tables.figures({k: t for k, t in found.items() if t}))
     return text
+
+
+def real_part(study: Study, runs: int, steps: int | None) -> Text:
+    """Recordings; the part's lines for the report."""
+    count = real.runs_in(runs)
+    found = {v: runs_of(study, v, (WORLD, *a), count) for v, a in real.planned(steps)}
+    judged = real.verdicts({v.key: there for v, there in found.items()}, steps)
+    text = ["## Recordings", "", reporting.counts(judged), "", *reporting.claims(judged), ""]
+    return text + titled_table("Errors", real.table({v.title: t for v, t in found.items() if t}))
 
 
 def titled_table(title: str, content: tables.Table) -> Text:

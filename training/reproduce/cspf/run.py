@@ -5,7 +5,7 @@ from pathlib import Path
 
 from coloc_env.options import unknown
 from training.evaluate import Progress
-from training.reproduce.cspf import plan, report
+from training.reproduce.cspf import plan, real, report
 from training.reproduce.pool import Note, fly
 from training.reproduce.reporting import failures
 from training.reproduce.store import Store
@@ -34,9 +34,9 @@ def reproduce(
     ``wanted``: these agents only; ``where``: these variants only; None: all. ``steps``: at most so
     many of each run. ``missing=False`` flies nothing.
     """
-    own, beyond = part != "robustness", part != "paper"
+    own, beyond, recorded = (part in (each, "all") for each in ("paper", "robustness", "real"))
     study = Study(Store(out / _STORE), seed)
-    planned = _plan(own, beyond, runs, steps)
+    planned = _plan(own, beyond, recorded, runs, steps)
     keys = list(dict.fromkeys(variant.key for variant, _, _ in planned))
     for key in where or ():
         if key not in keys:
@@ -61,12 +61,14 @@ def reproduce(
             text += report.paper_part(study, runs, steps, folder)
         if beyond:
             text += report.beyond_part(study, runs, steps)
+        if recorded:
+            text += report.real_part(study, runs, steps)
         text += failures(study)
         (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
 
 
 def _plan(
-    own: bool, beyond: bool, runs: int, steps: int | None
+    own: bool, beyond: bool, recorded: bool, runs: int, steps: int | None
 ) -> list[tuple[Variant, tuple[str, ...], int]]:
     """Variants, who flies in them, and how often."""
     planned: list[tuple[Variant, tuple[str, ...], int]] = []
@@ -78,4 +80,6 @@ def _plan(
     if beyond:
         for variant, agents in (plan.clouds(steps), *plan.teams(steps), *plan.hard(steps)):
             planned.append((variant, agents, plan.runs_in(variant, runs)))
+    if recorded:
+        planned += [(v, agents, real.runs_in(runs)) for v, agents in real.planned(steps)]
     return planned
