@@ -1,23 +1,13 @@
 """Figures of merit of runs: convergence of every holder about everybody, and the worst error."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from training.metrics import Flags, Floats
-from training.results import AgentResult, Results
+from training.reproduce.runs import AgentRuns
 
 
-@dataclass(frozen=True, eq=False)
-class Runs:
-    """An agent's runs in a variant."""
-
-    results: Results
-    agent: str
-
-    @property
-    def one(self) -> AgentResult:
-        return self.results.agents[self.agent]
+class Runs(AgentRuns):
+    """An agent's runs in a variant, as teams that agree are looked at."""
 
     @property
     def steps(self) -> int:

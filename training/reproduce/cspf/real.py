@@ -67,7 +67,8 @@ def runs_in(runs: int) -> int:
 
 
 def verdicts(found: Found, steps: int | None) -> list[Verdict]:
-    """The paper's claims of its section 6, where agents that they speak of were flown."""
+    """Section 6's claim that a filter stays bounded where dead reckoning drifts, and whether what
+    the paper says of particles and of consensus holds on recordings, where agents were flown."""
     judged = []
     for claim, key, agents in _claims(steps):
         there = found.get(key, {})
