@@ -8,7 +8,8 @@ from functools import partial
 import torch
 
 from agents.localizer import register
-from agents.swarm.filter import Found, Prepared, SwarmBelief, SwarmFilter, begun
+from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
+from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import lengths
 from agents.swarm.majorization import RELAXED, nodewise, own_pull, repeated, require_iterations
 from agents.swarm.spread import spread, told

@@ -15,7 +15,8 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import register
 from agents.swarm import joint, window
-from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
+from agents.swarm.belief import Found, Prepared, SwarmBelief
+from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.majorization import pull, require_iterations
 from coloc_env.scenario import Believed
 
@@ -108,12 +109,11 @@ class DynamicMds(SwarmFilter):
             y = self.slowed(belief, now, y)
         weight, shift = self.weigh(y, at)
         together = self.known(weight, informs, now, index)
-        variance = own_blocks(together).diagonal(dim1=-2, dim2=-1).mean(-1)
         past = now.past
         if past is not None:
             told = self.told(weight, now)
             past = window.pushed(past, now.place, now.joint, distance - shift, weight, told)
-        return Found(y, variance, together, past)
+        return Found(y, joint.variances(together), together, past)
 
     def trust(
         self,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from agents.localizer import register
 from agents.mds import MdsMap
-from agents.swarm.filter import Found, Prepared, SwarmBelief, begun
+from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
 from agents.swarm.links import connected, lengths
 from agents.swarm.majorization import RELAXED, descent, repeated, require_iterations
 from agents.swarm.spread import spread, told

@@ -3,7 +3,8 @@
 import torch
 
 from agents.localizer import register
-from agents.swarm.filter import Found, Prepared, SwarmBelief, SwarmFilter
+from agents.swarm.belief import Found, Prepared, SwarmBelief
+from agents.swarm.filter import SwarmFilter
 from agents.swarm.scaling import aligned, classical_scaling, shortest_paths
 from coloc_env.scenario import Believed
 

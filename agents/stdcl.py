@@ -15,7 +15,8 @@ from agents.localizer import Estimate, Localizer, register
 from agents.stgnn.features import Memory, Scene, forgotten, look
 from agents.stgnn.network import Correction, Past, StGnn
 from agents.swarm import joint
-from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter
+from agents.swarm.belief import Found, Prepared, SwarmBelief
+from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.links import along_links, lengths
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -92,18 +93,16 @@ class NetworkLoop(Localizer[LoopBelief]):
         if torch.is_grad_enabled():
             found = replace(found, position=found.position + _owed(belief, now, scene, shift))
         best = _corrected(now, found, correction)
-        kept, estimate = self.base.concluded(belief.base, now, best)
-        if self.feedback not in _POSITIONS:
-            kept, _ = self.base.concluded(belief.base, now, found)
+        goes_on = best if self.feedback in _POSITIONS else found
         after = build(
             LoopBelief,
             belief.batch_size,
-            base=kept,
+            base=self.base.concluded(belief.base, now, goes_on),
             memory=memory,
             past=past,
             confidence=self._fed_back(belief.confidence, now, best, correction),
         )
-        return after, estimate
+        return after, self.base.estimated(now, best)
 
     def diagnostics(self, belief: LoopBelief) -> dict[str, Float64[Tensor, "B N"]]:
         return self.base.diagnostics(belief.base)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from agents.localizer import register
 from agents.swarm import joint
-from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, own_blocks
+from agents.swarm.belief import Found, Prepared, SwarmBelief
+from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.gauss_newton import fisher, gauss_newton
 from coloc_env.scenario import Believed
 
@@ -43,8 +44,7 @@ class _Joint(SwarmFilter):
         weight, _ = self.weigh(position, now)
         told = fisher(position, self.told(weight, now)).flatten(3).flatten(1, 2)
         together = joint.posterior(told + precision, now.fixed, now.variance)
-        variance = own_blocks(together).diagonal(dim1=-2, dim2=-1).mean(-1)
-        return Found(position, variance, together)
+        return Found(position, joint.variances(together), together)
 
 
 @register("gn")

@@ -10,7 +10,8 @@ from functools import partial
 import torch
 
 from agents.localizer import register
-from agents.swarm.filter import Confidence, Found, Prepared, SwarmBelief, SwarmFilter, begun
+from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
+from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.majorization import guttman, majorizer, repeated, require_iterations
 from agents.swarm.spread import spread, told
 from coloc_env.scenario import Believed

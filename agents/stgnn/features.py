@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.swarm.filter import Found, Prepared
+from agents.swarm.belief import Found, Prepared
 from agents.swarm.links import along_links, lengths, own_information
 
 SCALARS = (

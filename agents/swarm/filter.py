@@ -1,93 +1,28 @@
 """What localizers of whole swarms share: dead reckoning, position fixes, and weights of links."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float64, Int64
-from tensordict import TensorClass
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
 from agents.swarm import calibration, drift, joint, persistence, weights, window
+from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.drift import Drift
-from agents.swarm.links import Links, connected, lengths, links_of
+from agents.swarm.links import connected, lengths, links_of
 from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import Ins, PositionFix, Ranging
 
-UNKNOWN = 1e12  # m²: variance of a position of which nothing is known
 Confidence = Literal["none", "huber", "em", "paper"]
 _ENOUGH = 50.0  # remembered errors of links between fixes: with fewer, all links' are learned from
-
-
-class SwarmBelief(TensorClass):
-    """Dead-reckoned state with the position last found, that position's variance (m², per axis) and
-    its rows of the team's joint covariance (``agents.swarm.joint``, m²; none where it is not kept);
-    the INS's bias (m/s) with its covariance with the position (m²/s) and its variance (m²/s²);
-    steps taken; and, the same for all, what is remembered of ranges' errors and of how links change
-    between clean and obstructed; of each link how likely it is obstructed (``paper``: how often it
-    was silent; none where that is not used); whether the UAV is ``localizable``: connected to so
-    many with fixes that they settle a position, d + 1; the ``past`` steps of a sliding window (none
-    where there is no such). Batch (B, N)."""
-
-    state: Float64[Tensor, "B N S"]
-    variance: Float64[Tensor, "B N"]
-    joint: Float64[Tensor, "B N e K"]
-    bias: Float64[Tensor, "B N d"]
-    drift: Float64[Tensor, "B N 2"]
-    step: Int64[Tensor, "B N"]
-    errors: Float64[Tensor, "B N 2 3"]
-    chain: Float64[Tensor, "B N 2 2"]
-    memory: Float64[Tensor, "B N L"]
-    localizable: Bool[Tensor, "B N"]
-    past: History
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """What a step has to find positions from: everybody's dead-reckoned ``state``, its ``place`` by
-    dead reckoning or fix (m), that place's ``variance`` (m² per axis) and what the step ``added``
-    to it, who is ``fixed``, the ``links``, the ``model`` of their errors; the variance that dead
-    reckoning alone has (``reckoned``), the joint covariance of the places (none where it is not
-    kept), the variance of the vectors ``between`` them (m² per axis), the INS's ``drift`` (None:
-    not estimated), how links change (``chain``), the probability that each is an ``outlier``
-    beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
-    and by what factor each link's weight is held down from outside (``confidence``, in [0, 1];
-    None: not at all); the ``past`` steps as they look from now (None: no window)."""
-
-    state: Float64[Tensor, "B N S"]
-    place: Float64[Tensor, "B N d"]
-    variance: Float64[Tensor, "B N"]
-    added: Float64[Tensor, "B N"]
-    fixed: Bool[Tensor, "B N"]
-    links: Links
-    model: calibration.ErrorModel
-    reckoned: Float64[Tensor, "B N"]
-    joint: Float64[Tensor, "B N e K"]
-    between: Float64[Tensor, "B N N"]
-    drift: Drift | None
-    chain: Float64[Tensor, "B 2 2"]
-    outlier: Float64[Tensor, "B N N"] | None = None
-    silent: Float64[Tensor, "B N N"] | None = None
-    confidence: Float64[Tensor, "B N N"] | None = None
-    past: History | None = None
-
-
-@dataclass(frozen=True)
-class Found:
-    """Positions (m), their variance (m² per axis), the joint covariance if there is one, and the
-    window of steps with this one in it (None: as it was)."""
-
-    position: Float64[Tensor, "B N d"]
-    variance: Float64[Tensor, "B N"]
-    joint: Float64[Tensor, "B N e K"] | None = None
-    past: History | None = None
 
 
 class SwarmFilter(Localizer[SwarmBelief]):
@@ -152,7 +87,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def step(self, belief: SwarmBelief, observation: Observation) -> tuple[SwarmBelief, Estimate]:
         now = self.prepared(belief, observation)
-        return self.concluded(belief, now, self.find(belief, now))
+        found = self.find(belief, now)
+        return self.concluded(belief, now, found), self.estimated(now, found)
 
     def prepared(self, belief: SwarmBelief, observation: Observation) -> Prepared:
         """What a step has to find positions from."""
@@ -200,28 +136,20 @@ class SwarmFilter(Localizer[SwarmBelief]):
             return replace(now, silent=silent)
         return now
 
-    def concluded(
-        self, belief: SwarmBelief, now: Prepared, found: Found
-    ) -> tuple[SwarmBelief, Estimate]:
-        """The belief that goes on from what was found, and the estimate."""
+    def concluded(self, belief: SwarmBelief, now: Prepared, found: Found) -> SwarmBelief:
+        """The belief that goes on from what was found."""
         d, shape = self.process.dim, now.fixed.shape
-        state = torch.cat((found.position, now.state[..., d:]), -1)
-        eye = torch.eye(d, dtype=state.dtype, device=state.device)
-        together, covariance = now.joint, found.variance[..., None, None] * eye
-        if found.joint is not None:
-            together, own = found.joint, own_blocks(found.joint)
-            covariance = own if own.shape[-1] == d else own * eye
         bias, moments = belief.bias, belief.drift
         if now.drift is not None:
             moved = found.position - now.state[..., :d]
             known = drift.informed(now.drift, moved, now.reckoned, found.variance)
             bias, moments = known.bias, torch.stack((known.cross, known.variance), -1)
-        after = build(
+        return build(
             SwarmBelief,
             shape,
-            state=state,
+            state=torch.cat((found.position, now.state[..., d:]), -1),
             variance=found.variance,
-            joint=together,
+            joint=now.joint if found.joint is None else found.joint,
             bias=bias,
             drift=moments,
             step=belief.step + 1,
@@ -231,14 +159,22 @@ class SwarmFilter(Localizer[SwarmBelief]):
             localizable=_localizable(now, d),
             past=belief.past if found.past is None else found.past,
         )
-        estimate = build(
+
+    def estimated(self, now: Prepared, found: Found) -> Estimate:
+        """What every UAV says of itself by what was found."""
+        d = self.process.dim
+        eye = torch.eye(d, dtype=found.position.dtype, device=found.position.device)
+        covariance = found.variance[..., None, None] * eye
+        if found.joint is not None:
+            own = joint.own_blocks(found.joint)
+            covariance = own if own.shape[-1] == d else own * eye
+        return build(
             Estimate,
-            shape,
+            now.fixed.shape,
             position=found.position,
-            velocity=state[..., d : 2 * d],
+            velocity=now.state[..., d : 2 * d],
             covariance=covariance,
         )
-        return after, estimate
 
     def diagnostics(self, belief: SwarmBelief) -> dict[str, Float64[Tensor, "B N"]]:
         """``localizable``; in calibrated ones what is believed of ranges: share, bias (m) and
@@ -377,30 +313,3 @@ def _localizable(now: Prepared, dim: int) -> Bool[Tensor, "B N"]:
     """Who is connected, over any number of links, to at least ``dim`` + 1 UAVs with fixes."""
     fixes = connected(now.links.mask).double() @ now.fixed.double().unsqueeze(-1)
     return fixes[..., 0] > dim
-
-
-def begun(now: Prepared) -> Prepared:
-    """The same where every UAV has a place to start from: who has none (a prior that is no number)
-    gets the middle of its neighbours', or of all, with a variance of ``UNKNOWN``."""
-    known = now.place.isfinite().all(-1)
-    if bool(known.all()):
-        return now
-    place = torch.where(known.unsqueeze(-1), now.place, 0.0)
-    count = known.double().unsqueeze(-1)
-    linked = now.links.mask.double()
-    near, everywhere = linked @ count, count.sum(1, keepdim=True).clamp_min(1.0)
-    middle = torch.where(
-        near > 0, linked @ place / near.clamp_min(1.0), place.sum(1, keepdim=True) / everywhere
-    )
-    return replace(
-        now,
-        place=torch.where(known.unsqueeze(-1), place, middle),
-        variance=torch.where(known, now.variance, UNKNOWN),
-        between=torch.where(known.unsqueeze(-1) & known.unsqueeze(-2), now.between, UNKNOWN),
-    )
-
-
-def own_blocks(joint: Float64[Tensor, "B N d N*d"]) -> Float64[Tensor, "B N d d"]:
-    """Each UAV's own block of a joint covariance."""
-    d = joint.shape[2]
-    return joint.unflatten(-1, (-1, d)).diagonal(dim1=1, dim2=3).movedim(-1, 1)

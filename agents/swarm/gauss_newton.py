@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from agents.swarm.joint import held
 from agents.swarm.links import along_links, lengths
 
 Weigh = Callable[
     [Float64[Tensor, "B N N"]], tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
 ]
-_NOTHING = 1e-10  # m⁻²: information on a UAV that nothing ties to an anchor
 
 
 def fisher(
@@ -50,7 +50,6 @@ def gauss_newton(
     ``fixed`` stays (information 1 m⁻², tied to nobody)."""
     n, d = y.shape[1:]
     still = fixed.repeat_interleave(d, -1)
-    tied = still.unsqueeze(-1) | still.unsqueeze(-2)
     matrix = precision
     for _ in range(iterations):
         length = lengths(y)
@@ -58,9 +57,7 @@ def gauss_newton(
         weight, shift = weigh(residual)
         down = along_links(y, weight * (residual - shift), length).flatten(1)
         down = down + (precision @ (prior - y).flatten(1).unsqueeze(-1))[..., 0]
-        matrix = fisher(y, weight).flatten(3).flatten(1, 2) + precision
-        matrix = matrix.masked_fill(tied, 0.0)
-        matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
+        matrix = held(fisher(y, weight).flatten(3).flatten(1, 2) + precision, fixed)
         factor = torch.linalg.cholesky_ex(matrix).L
         delta = torch.cholesky_solve(down.masked_fill(still, 0.0).unsqueeze(-1), factor)
         y = y + delta[..., 0].unflatten(-1, (n, d))

@@ -69,13 +69,23 @@ def whole(
     return joint
 
 
+def own_blocks(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N e e"]:
+    """Each UAV's own block."""
+    e = joint.shape[2]
+    return joint.unflatten(-1, (-1, e)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+
+
+def variances(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N"]:
+    """Each UAV's own variance (m² per axis)."""
+    return own_blocks(joint).diagonal(dim1=-2, dim2=-1).mean(-1)
+
+
 def scaled(
     joint: Float64[Tensor, "B N e K"], variance: Float64[Tensor, "B N"]
 ) -> Float64[Tensor, "B N e K"]:
     """The same correlations with other variances (m² per axis)."""
     e = joint.shape[2]
-    own = joint.flatten(1, 2).diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, e)).mean(-1)
-    factor = (variance / own).sqrt().repeat_interleave(e, -1)
+    factor = (variance / variances(joint)).sqrt().repeat_interleave(e, -1)
     whole = factor.unsqueeze(-1) * factor.unsqueeze(-2) * joint.flatten(1, 2)
     return whole.view_as(joint)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from agents import make
 from agents.localizer import Estimate
 from agents.swarm import joint, window
-from agents.swarm.filter import SwarmBelief
+from agents.swarm.belief import SwarmBelief
 from agents.swarm.links import lengths, links_of
 from agents.swarm.majorization import pull, stress
 from agents.swarm.window import History

@@ -17,8 +17,9 @@ from torch import Tensor
 from agents import make
 from agents.fc_mds import completed
 from agents.swarm import window
+from agents.swarm.belief import Prepared, SwarmBelief, begun
 from agents.swarm.calibration import believed_model
-from agents.swarm.filter import Prepared, SwarmBelief, SwarmFilter, begun
+from agents.swarm.filter import SwarmFilter
 from agents.swarm.gauss_newton import fisher
 from agents.swarm.links import Links, connected, lengths
 from agents.swarm.majorization import majorizer, nodewise, own_pull, stress

@@ -14,8 +14,8 @@ from agents.checkpoint import untrained
 from agents.stgnn.features import SCALARS, Memory, forgotten, look
 from agents.stgnn.layers import DilatedConvolution, TopologicalAttention, carried_over
 from agents.stgnn.network import DILATIONS, StGnn
+from agents.swarm.belief import Found, Prepared
 from agents.swarm.calibration import believed_model
-from agents.swarm.filter import Found, Prepared
 from agents.swarm.links import Links, lengths, own_information
 from agents.swarm.persistence import believed_chain
 
