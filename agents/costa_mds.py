@@ -55,6 +55,7 @@ class CostaMds(SwarmFilter):
         require_iterations(iterations, first)
         self.bandwidth, self.prior_weight, self.reach = bandwidth, prior_weight, reach
         self.iterations, self.first = iterations, first
+        self.recursive = prior_weight > 0
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
         now = begun(now)

@@ -23,7 +23,7 @@ from coloc_env.scenario import Believed
 _REFRESH = (0, 2)  # iterations at which weights are made anew
 _SELDOM = 10  # and, in the first step, every so many
 _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
-_RELAXED = 1.8  # of a step of the Guttman transform, which overestimates how much ranges hold
+_RELAXED = 1.8  # of a Guttman step, which overestimates how much many ranges hold together
 
 
 @register("dwmds_st")
@@ -70,6 +70,7 @@ class DynamicMds(SwarmFilter):
             raise ValueError(f"decay={decay} is not allowed: a rate in 1/s ≥ 0")
         self.prior, self.iterations, self.first, self.v_max = prior, iterations, first, v_max
         self.window, self.decay = window, decay
+        self.recursive = prior
 
     def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
         return joint.independent(variance, 1)
@@ -87,6 +88,7 @@ class DynamicMds(SwarmFilter):
         still, distance = now.fixed.unsqueeze(-1), now.links.distance
         y, at, factor = now.place, now, trust
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
+        relaxed = _RELAXED if self.dense else 1.0
         for k in range(self.first if bool(begins.any()) else self.iterations):
             goes_on = begins | (k < self.iterations)  # a world that is not new stops earlier
             if k in _REFRESH or k % _SELDOM == 0:
@@ -103,7 +105,7 @@ class DynamicMds(SwarmFilter):
                 down = down + window.pull(y, now.past)
             down = torch.where(still, 0.0, down)[:, index]
             down = down + trust @ (place - y)[:, index]
-            step = _RELAXED * torch.cholesky_solve(down, factor)
+            step = relaxed * torch.cholesky_solve(down, factor)
             y = torch.where(goes_on, y.index_add(1, index, step), y)
         if self.v_max is not None:
             y = self.slowed(belief, now, y)

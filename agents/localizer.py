@@ -50,6 +50,11 @@ class Localizer(ABC, Generic[Belief]):
     def __init__(self, believed: Believed) -> None:
         self.believed = believed
 
+    @classmethod
+    def suited(cls, believed: Believed, **chosen: Any) -> "Localizer":
+        """What ``make`` builds: one of these, or what makes one fit for such a team."""
+        return cls(believed, **chosen)
+
     @abstractmethod
     def reset(self, observation: Observation) -> Belief:
         """The belief before the first observation is used: the prior that it carries."""
@@ -143,8 +148,10 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
         chosen[key] = value
     options.check(name, chosen, known)
     believed = scenario if isinstance(scenario, Believed) else scenario.believed
+    factory = LOCALIZERS[name]
+    build: Callable[..., Localizer[Any]] = getattr(factory, "suited", factory)
     try:
-        return LOCALIZERS[name](believed, **chosen)
+        return build(believed, **chosen)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error

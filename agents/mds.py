@@ -18,6 +18,7 @@ class MdsMap(SwarmFilter):
     """
 
     name = "mds"
+    recursive = False
 
     def __init__(self, believed: Believed) -> None:
         super().__init__(believed, "none")

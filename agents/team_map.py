@@ -53,6 +53,7 @@ class Snapshot(_Joint):
     ``huber``, ``em`` or ``none``, as ``dwmds_st`` has it."""
 
     name = "gn"
+    recursive = False
 
     def __init__(
         self, believed: Believed, *, confidence: Confidence = "huber", iterations: int = 6

@@ -47,8 +47,9 @@ class Prepared:
     kept), the variance of the vectors ``between`` them (m² per axis), the INS's ``drift`` (None:
     not estimated), how links change (``chain``), the probability that each is an ``outlier``
     beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
-    and by what factor each link's weight is held down from outside (``confidence``, in [0, 1];
-    None: not at all); the ``past`` steps as they look from now (None: no window)."""
+    and by what factor each link's weight is changed from outside (``confidence``: held down in
+    [0, 1], above where it stands for several ranges; None: not at all); the ``past`` steps as they
+    look from now (None: no window)."""
 
     state: Float64[Tensor, "B N S"]
     place: Float64[Tensor, "B N d"]

@@ -2,7 +2,8 @@
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float64
@@ -19,7 +20,7 @@ from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import Ins, PositionFix, Ranging
+from coloc_env.sensors import AnchorRanging, Ins, PositionFix, Ranging
 
 Confidence = Literal["none", "huber", "em", "paper"]
 _ENOUGH = 50.0  # remembered errors of links between fixes: with fewer, all links' are learned from
@@ -35,17 +36,33 @@ class SwarmFilter(Localizer[SwarmBelief]):
     centralized = True
     window = 0  # steps that are remembered besides the present one
     decay = 0.0  # 1/s: at what rate they fade
+    recursive = True  # what it finds has dead reckoning in it, and is not news to that
+    dense = True  # many links to each UAV: enough to learn of all, and for over-relaxed steps
 
     def __init__(self, believed: Believed, confidence: Confidence, bias: bool = False) -> None:
         """``bias``: estimate the INS's, where the team has one that it believes to be biased."""
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
-        if sensor is None or sensor.tags:
-            raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
+        if sensor is None:
+            raise ValueError("a team with ranges between UAVs is needed")
+        if not is_plain(believed):
+            raise ValueError(
+                "a team without fixed anchors and lever arms, and with motion that is no more than "
+                "a position, is needed"
+            )
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.confidence = confidence
         ins = believed.sensor(Ins) if isinstance(believed.process, InsDriven) else None
         self.ins = ins if bias and ins is not None and ins.bias > 0 else None
+
+    @classmethod
+    def suited(cls, believed: Believed, **chosen: Any) -> Localizer:
+        """One of these; inside ``AmongAnchors`` for teams that are not plain."""
+        if is_plain(believed):
+            return cls(believed, **chosen)
+        from agents.swarm.among_anchors import AmongAnchors  # which is made of this module
+
+        return AmongAnchors(believed, partial(cls, **chosen))
 
     @abstractmethod
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
@@ -261,13 +278,13 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def _learned(self, belief: SwarmBelief, now: Prepared) -> Prepared:
         """The same with the error model after this step's links between those who know where they
-        are, how these change, and how likely each link is obstructed. Where such links are few, all
-        others count besides, with what is unsure of their ends."""
+        are, how these change, and how likely each link is obstructed. Where such links are few, but
+        links ``dense``, all others count besides, with what is unsure of their ends."""
         links, std = now.links, self.std
         guides = now.fixed.any(0).nonzero()[:, 0]
         known = links.mask & now.fixed.unsqueeze(-1) & now.fixed.unsqueeze(-2)
         remembered = 0.5 * calibration.FORGET * known.sum((-2, -1))
-        others = (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
+        others = self.dense * (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
         if bool((others > 0).any()):
             guides = torch.arange(links.mask.shape[-1], device=guides.device)
         rows, columns = guides.unsqueeze(-1), guides
@@ -302,6 +319,14 @@ class SwarmFilter(Localizer[SwarmBelief]):
             now.model, residual.flatten(1), unsure.flatten(1), self.std, now.outlier.flatten(1)
         )
         return torch.where(now.links.mask, seen.view_as(residual), now.outlier)
+
+
+def is_plain(believed: Believed) -> bool:
+    """Whether a team has ranges between centres alone, and positions that velocities move."""
+    ranging = believed.sensor(Ranging)
+    lever_arms = ranging is not None and ranging.tags
+    process = make_process(believed)
+    return not (lever_arms or believed.sensor(AnchorRanging) or process.error_size > process.dim)
 
 
 def _for_each(x: Float64[Tensor, "B *s"], shape: torch.Size) -> Float64[Tensor, "B N *s"]:

@@ -18,22 +18,34 @@ class Links:
 
 
 def links_of(observation: Observation) -> Links:
-    """The links that either end reports, from the leaves ``ranges`` and ``range_mask`` (single
-    tags) and, in teams with more UAVs than slots, ``neighbours``; no number, no link."""
-    ranges = observation["ranges"].double()
-    mask = (observation["range_mask"] > 0) & ranges.isfinite()
-    n = ranges.shape[-2]
+    """The links that either end reports, from the leaves of single tags; no number, no link."""
+    ranges, mask = (x[..., 0, 0] for x in ranges_of(observation, 1))
+    return Links(ranges, mask)
+
+
+def ranges_of(
+    observation: Observation, tags: int
+) -> tuple[Float64[Tensor, "B N N T T"], Bool[Tensor, "B N N T T"]]:
+    """Ranges (m) between UAVs i and j, tag a of the one and b of the other, [B, i, j, a, b], that
+    either end reports, and which there are: from the leaves ``ranges`` and ``range_mask`` and, in
+    teams with more UAVs than slots, ``neighbours``."""
+    shape = (-1, tags, tags)
+    ranges = observation["ranges"].double().unflatten(-1, shape)
+    mask = (observation["range_mask"] > 0).unflatten(-1, shape) & ranges.isfinite()
+    n = ranges.shape[1]
     if "neighbours" in observation:
-        index = observation["neighbours"].to(torch.int64)
-        there = torch.zeros(*mask.shape[:-1], n, dtype=torch.bool, device=mask.device)
-        wide = ranges.new_zeros(*mask.shape[:-1], n)
+        index = observation["neighbours"].to(torch.int64)[..., None, None].expand(mask.shape)
+        there = torch.zeros(*mask.shape[:2], n, tags, tags, dtype=torch.bool, device=mask.device)
+        wide = ranges.new_zeros(there.shape)
         # An empty slot names UAV 0: what it would write is written where it changes nothing.
-        index = torch.where(mask, index, torch.arange(n, device=mask.device).unsqueeze(-1))
-        ranges = wide.scatter(-1, index, torch.where(mask, ranges, 0.0))
-        mask = there.scatter(-1, index, mask)
-    either = mask | mask.mT
-    both = torch.where(mask, ranges, ranges.mT)
-    return Links(torch.where(either, both, 0.0), either)
+        own = torch.arange(n, device=mask.device)[:, None, None, None]
+        index = torch.where(mask, index, own)
+        ranges = wide.scatter(2, index, torch.where(mask, ranges, 0.0))
+        mask = there.scatter(2, index, mask)
+    theirs = mask.transpose(1, 2).mT
+    both = torch.where(mask, ranges, ranges.transpose(1, 2).mT)
+    either = mask | theirs
+    return torch.where(either, both, 0.0), either
 
 
 def lengths(position: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N N"]:
