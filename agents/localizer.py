@@ -128,8 +128,7 @@ def register(name: str) -> Callable[[_L], _L]:
 
 def options_of(name: str) -> dict[str, inspect.Parameter]:
     """Option names of a localizer with their types and defaults."""
-    if name not in LOCALIZERS:
-        raise ValueError(options.unknown("agent", name, sorted(LOCALIZERS)))
+    options.require_known("agent", [name], sorted(LOCALIZERS))
     return options.parameters(LOCALIZERS[name])
 
 

@@ -49,6 +49,14 @@ def parse(owner: str, text: str, known: Mapping[str, inspect.Parameter]) -> tupl
     raise ValueError(_unfit(owner, key, value, known))
 
 
+def require_known(what: str, wanted: Iterable[str] | None, known: Iterable[str]) -> None:
+    """Raise ValueError for a wanted name that does not exist; None wants nothing in particular."""
+    names = list(known)
+    for key in wanted or ():
+        if key not in names:
+            raise ValueError(unknown(what, key, names))
+
+
 def unknown(what: str, key: str, known: Iterable[str]) -> str:
     """The words for a name that does not exist: the closest one, and all there are."""
     names = list(known)

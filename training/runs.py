@@ -92,8 +92,7 @@ def register(factory: Callable[..., Training]) -> Callable[..., Training]:
 
 def options_of(name: str) -> dict[str, Any]:
     """Option names of a training with their types and defaults."""
-    if name not in TRAININGS:
-        raise ValueError(options.unknown("training", name, sorted(TRAININGS)))
+    options.require_known("training", [name], sorted(TRAININGS))
     return options.parameters(TRAININGS[name])
 
 

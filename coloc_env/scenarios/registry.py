@@ -24,8 +24,7 @@ def register(name: str) -> Callable[[Family], Family]:
 
 def overrides_of(name: str) -> dict[str, inspect.Parameter]:
     """Override names of a scenario with their types and defaults."""
-    if name not in FAMILIES:
-        raise ValueError(options.unknown("scenario", name, sorted(FAMILIES)))
+    options.require_known("scenario", [name], sorted(FAMILIES))
     return options.parameters(FAMILIES[name])
 
 

@@ -47,6 +47,16 @@ def fly(study: Study, pieces: Sequence[Piece], jobs: int, tell: Progress, note: 
         note(f"{what} ({time.monotonic() - start:.0f} s)")
 
 
+def obtain(
+    study: Study, pieces: Sequence[Piece], jobs: int, tell: Progress, note: Note, missing: bool
+) -> None:
+    """``fly``; with ``missing=False`` only note in ``study.failed`` what there is not."""
+    if missing:
+        fly(study, pieces, jobs, tell, note)
+    else:
+        study.do_without(pieces)
+
+
 def _work(
     left: Sequence[Piece], store: Store, jobs: int, tick: Callable[[int], None]
 ) -> Iterator[tuple[Piece, str | None]]:

@@ -75,6 +75,12 @@ def failures(study: Study) -> Text:
     return ["", "## Not flown", "", *lines]
 
 
+def write_report(folder: Path, name: str, source: str, text: Text, study: Study) -> None:
+    """``report.md`` of a paper: what was found, and what could not be flown."""
+    text = [f"# {name}, reproduced", "", f"{source}.", "", *text, *failures(study)]
+    (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+
+
 def as_json(each: Verdict) -> dict[str, Any]:
     """A verdict as plain values."""
     ours = each.ours

@@ -17,6 +17,7 @@ import torch
 
 from agents.localizer import make
 from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
+from coloc_env.options import require_known
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from training.evaluate import Progress, evaluate
@@ -47,6 +48,9 @@ class Variant:
     def build(self) -> Scenario:
         """ValueError or OSError where it cannot be (recordings that are not there)."""
         return _built(self)
+
+
+Planned = tuple[Variant, tuple[str, ...], int]  # who flies there, and how often
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,28 @@ class Study:
             Piece(variant, agent, self.seed + start, runs)
             for start, runs in zip(starts, blocks, strict=True)
         ]
+
+    def chosen(
+        self,
+        planned: Sequence[Planned],
+        where: Sequence[str] | None,
+        agents: Sequence[str] | None = None,
+    ) -> list[Piece]:
+        """The pieces of a plan in the variants ``where``, of these agents (None: all); the rest is
+        noted in ``failed``. Raises ValueError for a variant that is not in the plan."""
+        require_known("variant", where, dict.fromkeys(variant.key for variant, _, _ in planned))
+        found: list[Piece] = []
+        for variant, able, count in planned:
+            if where is not None and variant.key not in where:
+                self.failed[variant.key, WORLD] = "not asked for"
+                continue
+            for agent in (WORLD, *able):
+                pieces = self.pieces(variant, agent, count)
+                if agents is None or agent in (WORLD, *agents):
+                    found += pieces
+                else:
+                    self.do_without(pieces)
+        return found
 
     def missing(self, pieces: Sequence[Piece]) -> list[Piece]:
         """Those not computed yet, once each. Where the scenario cannot be built, or the agent does

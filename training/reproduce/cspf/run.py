@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from coloc_env.options import unknown
 from training.evaluate import Progress
 from training.reproduce.cspf import plan, real, report
-from training.reproduce.pool import Note, fly
-from training.reproduce.reporting import failures
+from training.reproduce.pool import Note, obtain
+from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
-from training.reproduce.study import WORLD, Piece, Study, Variant
+from training.reproduce.study import Planned, Study
 from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
@@ -37,25 +36,9 @@ def reproduce(
     own, beyond, recorded = (part in (each, "all") for each in ("paper", "robustness", "real"))
     study = Study(Store(out / _STORE), seed)
     planned = _plan(own, beyond, recorded, runs, steps)
-    keys = list(dict.fromkeys(variant.key for variant, _, _ in planned))
-    for key in where or ():
-        if key not in keys:
-            raise ValueError(unknown("variant", key, keys))
-    pieces: list[Piece] = []
-    for variant, agents, count in planned:
-        if where is not None and variant.key not in where:
-            study.failed[variant.key, WORLD] = "not asked for"
-            continue
-        for agent in (WORLD, *agents):
-            if wanted is None or agent in (WORLD, *wanted):
-                pieces += study.pieces(variant, agent, count)
-            else:
-                study.do_without(study.pieces(variant, agent, count))
-    if missing:
-        fly(study, pieces, jobs, tell, note)
-    else:
-        study.do_without(pieces)
-    text = ["# CSPF, reproduced", "", f"{plan.TITLE}.", ""]
+    pieces = study.chosen(planned, where, wanted)
+    obtain(study, pieces, jobs, tell, note, missing)
+    text: Text = []
     with staged_folder(out, NAMES) as folder:
         if own:
             text += report.paper_part(study, runs, steps, folder)
@@ -63,15 +46,11 @@ def reproduce(
             text += report.beyond_part(study, runs, steps)
         if recorded:
             text += report.real_part(study, runs, steps)
-        text += failures(study)
-        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+        write_report(folder, "CSPF", plan.TITLE, text, study)
 
 
-def _plan(
-    own: bool, beyond: bool, recorded: bool, runs: int, steps: int | None
-) -> list[tuple[Variant, tuple[str, ...], int]]:
-    """Variants, who flies in them, and how often."""
-    planned: list[tuple[Variant, tuple[str, ...], int]] = []
+def _plan(own: bool, beyond: bool, recorded: bool, runs: int, steps: int | None) -> list[Planned]:
+    planned: list[Planned] = []
     if own:
         for dim in plan.DIMS:
             beside = (*plan.BESIDE, *plan.LITERAL)

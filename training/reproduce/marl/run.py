@@ -4,12 +4,12 @@ import multiprocessing
 from collections.abc import Sequence
 from pathlib import Path
 
-from coloc_env.options import unknown
+from coloc_env.options import require_known
 from training import runs as training_runs
 from training.evaluate import Progress
 from training.reproduce.marl import report
 from training.reproduce.marl.plan import FILTERS, SEEDS, Trained, trainings, variants
-from training.reproduce.pool import Note, fly
+from training.reproduce.pool import Note, obtain
 from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study
 from training.staging import staged_folder
@@ -34,10 +34,7 @@ def reproduce(
     ``wanted``: these trainings only. ``missing=False`` trains and flies nothing.
     """
     planned = trainings()
-    keys = [one.key for one in planned]
-    for key in wanted or ():
-        if key not in keys:
-            raise ValueError(unknown("training", key, keys))
+    require_known("training", wanted, [one.key for one in planned])
     planned = [one for one in planned if wanted is None or one.key in wanted]
     todo = [(one, k, folder_of(out, one, k)) for one in planned for k in range(SEEDS)]
     if missing:
@@ -52,10 +49,7 @@ def reproduce(
         learned = [agent for key in policies for agent in agents.get(key, [])]
         for agent in (WORLD, *FILTERS, *learned):
             pieces += study.pieces(variant, agent, runs)
-    if missing:
-        fly(study, pieces, jobs, tell, note)
-    else:
-        study.do_without(pieces)
+    obtain(study, pieces, jobs, tell, note, missing)
     with staged_folder(out, report.FILES) as folder:
         report.write(study, planned, agents, out / _RUNS, runs, folder)
 

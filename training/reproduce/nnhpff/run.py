@@ -4,16 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import training.nnhpff as _nnhpff  # noqa: F401  (registers its training)
-from coloc_env.options import unknown
 from training import runs as training_runs
 from training.evaluate import Progress
 from training.reproduce.cost import measured
 from training.reproduce.nnhpff import plan, report
 from training.reproduce.nnhpff.flown import Flown, learning_curve
-from training.reproduce.pool import Note, fly
-from training.reproduce.reporting import failures
+from training.reproduce.pool import Note, obtain
+from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
-from training.reproduce.study import WORLD, Piece, Study, Variant
+from training.reproduce.study import Planned, Study
 from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
@@ -41,44 +40,26 @@ def reproduce(
     """
     own, beyond = part != "robustness", part != "paper"
     study = Study(Store(out / _STORE), seed)
-    wanted = _plan(own, beyond, runs, steps)
-    keys = list(dict.fromkeys(variant.key for variant, _, _ in wanted))
-    for key in where or ():
-        if key not in keys:
-            raise ValueError(unknown("variant", key, keys))
-    pieces: list[Piece] = []
-    for variant, agents, count in wanted:
-        if where is None or variant.key in where:
-            for agent in (WORLD, *agents):
-                pieces += study.pieces(variant, agent, count)
-        else:
-            study.failed[variant.key, WORLD] = "not asked for"
-    if missing:
-        fly(study, pieces, jobs, tell, note)
-        if own and where is None and steps is None:
-            _learn(out / _RUN, tell)
-    else:
-        study.do_without(pieces)
+    pieces = study.chosen(_plan(own, beyond, runs, steps), where)
+    obtain(study, pieces, jobs, tell, note, missing)
+    if missing and own and where is None and steps is None:
+        _learn(out / _RUN, tell)
     first = plan.case(1, steps)
     timed = [a for a in (*plan.METHODS, "ekf") if (first.key, a) not in study.failed]
     cost = measured(study.store, first, seed, timed, tell) if own and study.can(first) else {}
     flown = Flown(study, cost, learning_curve(out / _RUN))
-    text = ["# NN-HPFF, reproduced", "", f"{plan.TITLE}.", ""]
+    text: Text = []
     with staged_folder(out, NAMES) as folder:
         if own:
             text += report.paper_part(flown, runs, steps, folder)
             text += report.detector_part(flown, plan.scenario_runs(runs), steps, folder)
         if beyond:
             text += report.beyond_part(flown, runs, steps, folder)
-        text += failures(study)
-        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+        write_report(folder, "NN-HPFF", plan.TITLE, text, study)
 
 
-def _plan(
-    own: bool, beyond: bool, runs: int, steps: int | None
-) -> list[tuple[Variant, tuple[str, ...], int]]:
-    """Variants, who flies in them, and how often."""
-    wanted: list[tuple[Variant, tuple[str, ...], int]] = []
+def _plan(own: bool, beyond: bool, runs: int, steps: int | None) -> list[Planned]:
+    wanted: list[Planned] = []
     if own:
         for number in plan.CASES:
             wanted.append((plan.case(number, steps), (*plan.METHODS, *plan.BESIDE), runs))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.localizer import make
-from coloc_env.options import unknown
+from coloc_env.options import require_known
 from training.evaluate import Progress
 from training.reproduce.cost import measured
 from training.reproduce.pfnn import paper, report
@@ -20,8 +20,8 @@ from training.reproduce.pfnn.plan import (
     variants,
 )
 from training.reproduce.pfnn.robustness import cells
-from training.reproduce.pool import Note, fly
-from training.reproduce.reporting import failures
+from training.reproduce.pool import Note, obtain
+from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study, Variant
 from training.staging import staged_folder
@@ -55,10 +55,7 @@ def reproduce(
     robust = list(ROBUST_AGENTS if agents is None else agents) if beyond else []
     base, worlds = default(steps), variants(steps)
     if where is not None:
-        keys = [variant.key for variant in worlds]
-        for key in where:
-            if key not in keys:
-                raise ValueError(unknown("variant", key, keys))
+        require_known("variant", where, [variant.key for variant in worlds])
         worlds = [variant for variant in worlds if variant.key in where]
     every = list(dict.fromkeys((*methods, *ranges, *robust)))
     for agent in (*every, *(agents or ())):
@@ -79,21 +76,17 @@ def reproduce(
         for variant in worlds:
             for agent in (WORLD, *robust):
                 pieces += study.pieces(variant, agent, runs_in(variant, runs))
-    if missing:
-        fly(study, pieces, jobs, tell, note)
-    else:
-        study.do_without(pieces)
+    obtain(study, pieces, jobs, tell, note, missing)
 
     flown = _flown(study, base, blocks, methods, ranges, tell) if own else None
-    text = ["# PF-NN, reproduced", "", f"{paper.TITLE}.", ""]
+    text: Text = []
     with staged_folder(out, NAMES) as folder:
         if flown is not None:
             text += [*report.paper_part(flown, folder), ""]
         if beyond:
             found, bounds = cells(study, worlds, robust, runs)
             text += report.robust_part(found, bounds, worlds, robust, folder)
-        text += failures(study)
-        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+        write_report(folder, "PF-NN", paper.TITLE, text, study)
 
 
 def _flown(

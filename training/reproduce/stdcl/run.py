@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coloc_env.options import unknown
+from coloc_env.options import require_known
 from training.evaluate import Progress
 from training.reproduce.cost import Cost, measured
-from training.reproduce.pool import Note, fly
-from training.reproduce.reporting import failures
+from training.reproduce.pool import Note, obtain
+from training.reproduce.reporting import Text, write_report
 from training.reproduce.stdcl import links, plan, report
 from training.reproduce.stdcl.flown import Flown
 from training.reproduce.stdcl.plan import METHODS, OPTIMIZER, REFERENCES, WHOLE, Plan
@@ -44,23 +44,17 @@ def reproduce(
     the, study = Plan(runs, steps, n_uavs), Study(Store(out / _STORE), seed)
     scenes = plan.merged(scene for each in parts for scene in the.scenes(each))
     timed = _timed(the, parts)
-    keys = list(dict.fromkeys((*scenes, *(variant.key for variant, _ in timed))))
-    for key in where or ():
-        if key not in keys:
-            raise ValueError(unknown("variant", key, keys))
+    require_known("variant", where, dict.fromkeys((*scenes, *(v.key for v, _ in timed))))
     wanted = {key: s for key, s in scenes.items() if where is None or key in where}
     pieces = [piece for scene in wanted.values() for piece in scene.pieces(study)]
-    if missing:
-        fly(study, pieces, jobs, tell, note)
-    else:
-        study.do_without(pieces)
+    obtain(study, pieces, jobs, tell, note, missing)
     cost: dict[str, dict[str, Cost]] = {}
     for variant, agents in timed:
         if where is None or variant.key in where:
             able = _able(study, variant, agents)
             cost[variant.key] = measured(study.store, variant, seed, able, tell, missing)
     flown = _watched(Flown(study, wanted, cost, {}, None, None), the, tell, missing)
-    text = ["# ST-DCL, reproduced", "", f"{plan.TITLE}.", ""]
+    text: Text = []
     with staged_folder(out, NAMES) as folder:
         text += report.claims_part(flown, the, parts, folder)
         if "paper" in parts:
@@ -73,8 +67,7 @@ def reproduce(
             text += report.campus_part(flown, the, folder)
         if "real" in parts:
             text += report.real_part(flown, the)
-        text += failures(study)
-        (folder / "report.md").write_text("\n".join(text).rstrip() + "\n", encoding="utf-8")
+        write_report(folder, "ST-DCL", plan.TITLE, text, study)
 
 
 def _timed(the: Plan, parts: Sequence[str]) -> list[tuple[Variant, tuple[str, ...]]]:
