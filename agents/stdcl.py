@@ -29,6 +29,7 @@ _RATE = math.log(1.1)  # largest change of a link's confidence in a step, as a l
 _LEAST = 0.1  # confidence of a link
 _REACH = 3.0  # standard deviations
 _GAIN = 0.05  # κ of the paper's feedback
+_PACE = 1.0  # s between steps in training
 
 
 class LoopBelief(TensorClass):
@@ -58,6 +59,7 @@ class NetworkLoop(Localizer[LoopBelief]):
     def __init__(self, base: SwarmFilter, network: StGnn, feedback: Feedback) -> None:
         super().__init__(base.believed)
         self.base, self.feedback = base, feedback
+        self.rate = min(1.0, base.believed.arena.dt / _PACE)
         self.network = network.double().requires_grad_(False)
 
     def learn(self, network: StGnn) -> None:
@@ -92,7 +94,7 @@ class NetworkLoop(Localizer[LoopBelief]):
         correction, past = self.network(scene, belief.past)
         if torch.is_grad_enabled():
             found = replace(found, position=found.position + _owed(belief, now, scene, shift))
-        best = _corrected(now, found, correction)
+        best = _corrected(now, found, correction, self.rate)
         goes_on = best if self.feedback in _POSITIONS else found
         after = build(
             LoopBelief,
@@ -140,11 +142,13 @@ def _owed(
     return torch.where(scene.moves.unsqueeze(-1), (scene.gain @ push.unsqueeze(-1))[..., 0], 0.0)
 
 
-def _corrected(now: Prepared, found: Found, correction: Correction) -> Found:
-    """p̂ = p + γ Δp (eq. 34) and its variance, dead reckoning's at most; who is fixed stays."""
+def _corrected(now: Prepared, found: Found, correction: Correction, rate: float) -> Found:
+    """p̂ = p + γ Δp (eq. 34) and its variance, dead reckoning's at most; who is fixed stays. What
+    the network says of variances multiplies from step to step: steps that are ``rate`` times as
+    long as in training take that power of it."""
     moves = ~now.fixed
     position = found.position + correction.offset.double()
-    variance = torch.minimum(found.variance * correction.spread.double(), now.variance)
+    variance = torch.minimum(found.variance * correction.spread.double() ** rate, now.variance)
     variance = torch.where(moves, variance, found.variance)
     return Found(
         torch.where(moves.unsqueeze(-1), position, found.position),

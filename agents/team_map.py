@@ -9,10 +9,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from agents.localizer import register
-from agents.swarm import joint
+from agents.swarm import delays, joint
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import Confidence, SwarmFilter
-from agents.swarm.gauss_newton import fisher, gauss_newton
+from agents.swarm.gauss_newton import coordinates, gauss_newton, informed
+from agents.swarm.links import lengths
 from coloc_env.scenario import Believed
 
 
@@ -20,9 +21,14 @@ class _Joint(SwarmFilter):
     """Gauss–Newton with ``iterations`` a step."""
 
     def __init__(
-        self, believed: Believed, confidence: Confidence, iterations: int, bias: bool = False
+        self,
+        believed: Believed,
+        confidence: Confidence,
+        iterations: int,
+        bias: bool = False,
+        delays: bool = False,
     ) -> None:
-        super().__init__(believed, confidence, bias)
+        super().__init__(believed, confidence, bias, delays)
         if iterations < 1:
             raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.iterations = iterations
@@ -32,7 +38,7 @@ class _Joint(SwarmFilter):
 
     def solved(self, now: Prepared, precision: Float64[Tensor, "B K K"]) -> Found:
         """Positions, and the inverse of their joint information."""
-        position, _ = gauss_newton(
+        position, late, _ = gauss_newton(
             now.place,
             now.links.distance,
             lambda residual: self.weigh_residual(residual, now),
@@ -41,10 +47,16 @@ class _Joint(SwarmFilter):
             precision,
             self.iterations,
         )
-        weight, _ = self.weigh(position, now)
-        told = fisher(position, self.told(weight, now)).flatten(3).flatten(1, 2)
-        together = joint.posterior(told + precision, now.fixed, now.variance)
-        return Found(position, joint.variances(together), together)
+        residual = now.links.distance - lengths(position) - delays.added(late)
+        weight, _ = self.weigh_residual(residual, now)
+        d, size = self.process.dim, precision.shape[-1]
+        told = informed(position, self.told(weight, now), self.clock is not None)
+        known = now.variance.repeat_interleave(d, -1)
+        known = torch.nn.functional.pad(known, (0, size - known.shape[-1]))
+        still = coordinates(now.fixed, d, size)
+        covariance = joint.left_by(told + precision, still, known)
+        together, learned = delays.parts(covariance, now.delays.delay + late, d)
+        return Found(position, joint.variances(together), together, delays=learned)
 
 
 @register("gn")
@@ -67,7 +79,8 @@ class Snapshot(_Joint):
 @register("map")
 class RecursiveMap(_Joint):
     """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
-    ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them."""
+    ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does not
+    estimate what clocks and antennas add to ranges."""
 
     name = "map"
 
@@ -78,8 +91,11 @@ class RecursiveMap(_Joint):
         confidence: Confidence = "em",
         iterations: int = 3,
         bias: bool = True,
+        delays: bool = True,
     ) -> None:
-        super().__init__(believed, confidence, iterations, bias)
+        super().__init__(believed, confidence, iterations, bias, delays)
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        return self.solved(now, joint.precision(now.joint, now.fixed))
+        whole = delays.whole(now.joint, now.delays)
+        still = coordinates(now.fixed, self.process.dim, whole.shape[-1])
+        return self.solved(now, joint.held_by(whole, still))

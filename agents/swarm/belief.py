@@ -8,6 +8,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.swarm.calibration import ErrorModel
+from agents.swarm.delays import Delays
 from agents.swarm.drift import Drift
 from agents.swarm.links import Links
 from agents.swarm.window import History
@@ -23,7 +24,7 @@ class SwarmBelief(TensorClass):
     between clean and obstructed; of each link how likely it is obstructed (``paper``: how often it
     was silent; none where that is not used); whether the UAV is ``localizable``: connected to so
     many with fixes that they settle a position, d + 1; the ``past`` steps of a sliding window (none
-    where there is no such). Batch (B, N)."""
+    where there is no such); what antennas add to ranges (``delays``). Batch (B, N)."""
 
     state: Float64[Tensor, "B N S"]
     variance: Float64[Tensor, "B N"]
@@ -36,6 +37,7 @@ class SwarmBelief(TensorClass):
     memory: Float64[Tensor, "B N L"]
     localizable: Bool[Tensor, "B N"]
     past: History
+    delays: Delays
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class Prepared:
     beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
     and by what factor each link's weight is changed from outside (``confidence``: held down in
     [0, 1], above where it stands for several ranges; None: not at all); the ``past`` steps as they
-    look from now (None: no window)."""
+    look from now (None: no window); what antennas add to ranges (``delays``), taken off the links'
+    distances as far as it is known."""
 
     state: Float64[Tensor, "B N S"]
     place: Float64[Tensor, "B N d"]
@@ -63,6 +66,7 @@ class Prepared:
     between: Float64[Tensor, "B N N"]
     drift: Drift | None
     chain: Float64[Tensor, "B 2 2"]
+    delays: Delays
     outlier: Float64[Tensor, "B N N"] | None = None
     silent: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
@@ -71,13 +75,14 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Found:
-    """Positions (m), their variance (m² per axis), the joint covariance if there is one, and the
-    window of steps with this one in it (None: as it was)."""
+    """Positions (m), their variance (m² per axis), the joint covariance if there is one, the window
+    of steps with this one in it and what antennas add to ranges (None: as it was)."""
 
     position: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"] | None = None
     past: History | None = None
+    delays: Delays | None = None
 
 
 def begun(now: Prepared) -> Prepared:

@@ -12,10 +12,10 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
-from agents.swarm import calibration, drift, joint, persistence, weights, window
+from agents.swarm import calibration, delays, drift, joint, persistence, weights, window
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.drift import Drift
-from agents.swarm.links import connected, lengths, links_of
+from agents.swarm.links import Links, connected, lengths, links_of
 from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -39,8 +39,15 @@ class SwarmFilter(Localizer[SwarmBelief]):
     recursive = True  # what it finds has dead reckoning in it, and is not news to that
     dense = True  # many links to each UAV: enough to learn of all, and for over-relaxed steps
 
-    def __init__(self, believed: Believed, confidence: Confidence, bias: bool = False) -> None:
-        """``bias``: estimate the INS's, where the team has one that it believes to be biased."""
+    def __init__(
+        self,
+        believed: Believed,
+        confidence: Confidence,
+        bias: bool = False,
+        delays: bool = False,
+    ) -> None:
+        """``bias``: estimate the INS's, where the team has one that it believes to be biased;
+        ``delays``: estimate what antennas add to ranges, where it believes that they do."""
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
         if sensor is None:
@@ -54,6 +61,10 @@ class SwarmFilter(Localizer[SwarmBelief]):
         self.confidence = confidence
         ins = believed.sensor(Ins) if isinstance(believed.process, InsDriven) else None
         self.ins = ins if bias and ins is not None and ins.bias > 0 else None
+        clock = sensor.clock
+        self.clock = (
+            clock if delays and clock is not None and clock.offset + clock.skew > 0 else None
+        )
 
     @classmethod
     def suited(cls, believed: Believed, **chosen: Any) -> Localizer:
@@ -95,6 +106,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             memory=variance.new_zeros(*shape, width) + usual,
             localizable=torch.zeros(shape, dtype=torch.bool, device=state.device),
             past=window.begun(state[..., :d], known, self.window),
+            delays=delays.begun(state[..., :d], self.clock),
             batch_size=shape,
         )
 
@@ -129,7 +141,12 @@ class SwarmFilter(Localizer[SwarmBelief]):
         else:
             together = belief.joint
             between = variance.unsqueeze(-1) + variance.unsqueeze(-2)
-        links = links_of(observation)
+        links, late = links_of(observation), belief.delays
+        if self.clock is not None:
+            late = delays.carried(late, kept, fixed, dt, self.clock)
+            off = links.distance - delays.added(late.delay)
+            links = Links(torch.where(links.mask, off, 0.0), links.mask)
+            between = between + delays.unsure(late)
         now = Prepared(
             state,
             place,
@@ -143,6 +160,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             between,
             moving,
             belief.chain[:, 0],
+            late,
             past=self._past(belief, place, kept, added, fixed, spread, dt),
         )
         if self.confidence == "em":
@@ -175,6 +193,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             memory=self._remembered(belief, now, found),
             localizable=_localizable(now, d),
             past=belief.past if found.past is None else found.past,
+            delays=now.delays if found.delays is None else found.delays,
         )
 
     def estimated(self, now: Prepared, found: Found) -> Estimate:
@@ -195,7 +214,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def diagnostics(self, belief: SwarmBelief) -> dict[str, Float64[Tensor, "B N"]]:
         """``localizable``; in calibrated ones what is believed of ranges: share, bias (m) and
-        persistence ρ of outliers; the size of the INS's bias (m/s) that is taken off."""
+        persistence ρ of outliers; the size of the INS's bias (m/s) and the antenna's delay (m) that
+        are taken off."""
         own = {"localizable": belief.localizable.double()}
         if self.confidence == "em":
             sums, shape = belief.errors[:, 0], belief.step.shape
@@ -207,6 +227,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
             own["outlier_persistence"] = rho.unsqueeze(-1).expand(shape)
         if self.ins is not None:
             own["ins_bias"] = belief.bias.norm(dim=-1)
+        if self.clock is not None:
+            own["antenna_delay"] = belief.delays.delay[..., 0]
         return own
 
     def weigh(
@@ -315,6 +337,9 @@ class SwarmFilter(Localizer[SwarmBelief]):
             return belief.memory if now.silent is None else now.silent
         residual = now.links.distance - lengths(found.position.detach())
         unsure = now.between if found.joint is None else joint.between(found.joint)
+        if self.clock is not None and found.delays is not None:
+            residual = residual - delays.added(found.delays.delay - now.delays.delay)
+            unsure = unsure + delays.unsure(found.delays)
         seen = calibration.outlier_probability(
             now.model, residual.flatten(1), unsure.flatten(1), self.std, now.outlier.flatten(1)
         )

@@ -94,10 +94,17 @@ def precision(
     joint: Float64[Tensor, "B N e K"], fixed: Bool[Tensor, "B N"]
 ) -> Float64[Tensor, "B K K"]:
     """The information (1/m²) that it holds on those who are not fixed; 0 for the others."""
-    still, tied = _fixed(fixed, joint.shape[2])
-    whole = joint.flatten(1, 2).masked_fill(tied, 0.0)
-    whole.diagonal(dim1=-2, dim2=-1).masked_fill_(still, 1.0)
-    return _inverse(whole).masked_fill(tied, 0.0)
+    return held_by(joint.flatten(1, 2), fixed.repeat_interleave(joint.shape[2], -1))
+
+
+def held_by(
+    covariance: Float64[Tensor, "B K K"], still: Bool[Tensor, "B K"]
+) -> Float64[Tensor, "B K K"]:
+    """The information that a covariance holds on what is not ``still``; 0 on that."""
+    tied = _tied(still)
+    covariance = covariance.masked_fill(tied, 0.0)
+    covariance.diagonal(dim1=-2, dim2=-1).masked_fill_(still, 1.0)
+    return _inverse(covariance).masked_fill(tied, 0.0)
 
 
 def laplacian(
@@ -117,24 +124,30 @@ def posterior(
 ) -> Float64[Tensor, "B N e K"]:
     """The joint covariance from all information (1/m²), and the ``variance`` of who is fixed."""
     e = information.shape[-1] // fixed.shape[-1]
-    still, tied = _fixed(fixed, e)
-    whole = _inverse(held(information, fixed)).masked_fill(tied, 0.0)
-    known = torch.where(still, variance.repeat_interleave(e, -1), 0.0)
-    whole.diagonal(dim1=-2, dim2=-1).add_(known)
-    return whole.unflatten(1, (-1, e))
+    still, known = (each.repeat_interleave(e, -1) for each in (fixed, variance))
+    return left_by(information, still, known).unflatten(1, (-1, e))
 
 
-def held(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B N"]) -> Float64[Tensor, "B K K"]:
-    """A matrix of information in which who is fixed is tied to nobody and has 1 m⁻²."""
-    still, tied = _fixed(fixed, matrix.shape[-1] // fixed.shape[-1])
-    matrix = matrix.masked_fill(tied, 0.0)
+def left_by(
+    information: Float64[Tensor, "B K K"],
+    still: Bool[Tensor, "B K"],
+    variance: Float64[Tensor, "B K"],
+) -> Float64[Tensor, "B K K"]:
+    """The covariance that information leaves, and the ``variance`` (m²) of what is ``still``."""
+    whole = _inverse(held(information, still)).masked_fill(_tied(still), 0.0)
+    whole.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, variance, 0.0))
+    return whole
+
+
+def held(matrix: Float64[Tensor, "B K K"], still: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
+    """A matrix of information in which what is ``still`` is tied to nothing and has 1 m⁻²."""
+    matrix = matrix.masked_fill(_tied(still), 0.0)
     matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
     return matrix
 
 
-def _fixed(fixed: Bool[Tensor, "B N"], e: int) -> tuple[Bool[Tensor, "B K"], Bool[Tensor, "B K K"]]:
-    still = fixed.repeat_interleave(e, -1)
-    return still, still.unsqueeze(-1) | still.unsqueeze(-2)
+def _tied(still: Bool[Tensor, "B K"]) -> Bool[Tensor, "B K K"]:
+    return still.unsqueeze(-1) | still.unsqueeze(-2)
 
 
 def _inverse(matrix: Float64[Tensor, "B K K"]) -> Float64[Tensor, "B K K"]:

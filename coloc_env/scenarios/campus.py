@@ -105,11 +105,12 @@ def campus(
     own: tuple[Sensor, ...] = (Ins(ins_std, ins_bias, ins_bias_time),)
     if guides:
         own = (*own, PositionFix(anchor_std, guides))
+    clocks = Clock(clock_offset, clock_skew)
     ranging = Ranging(
         error,
         walls=(BUILDING,),
         excess=wall_excess,
-        clock=Clock(clock_offset, clock_skew),
+        clock=clocks,
     )
     return Scenario(
         name="campus-v0",
@@ -128,7 +129,7 @@ def campus(
         ),
         prior=Prior(position_std=prior_std),
         process=InsDriven(2.0 / dt),
-        believed_sensors=(*own, Ranging(assumed)),
+        believed_sensors=(*own, Ranging(assumed, clock=clocks)),
         failure_rate=failure_rate,
         reward=reward,
         guides=guides,

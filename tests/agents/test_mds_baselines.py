@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents import make
 from agents.fc_mds import completed
-from agents.swarm import window
+from agents.swarm import delays, window
 from agents.swarm.belief import Prepared, SwarmBelief, begun
 from agents.swarm.calibration import believed_model
 from agents.swarm.filter import SwarmFilter
@@ -62,6 +62,7 @@ def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> Prepa
         joint=variance.new_zeros(worlds, n, 1, 0),
         between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
         drift=None,
+        delays=delays.begun(place, None),
         chain=believed_chain(torch.full((worlds,), 0.1, dtype=torch.float64)),
         fixed=fixed,
         links=Links((true + STD * (noise + noise.mT)) * mask, mask),
@@ -90,6 +91,7 @@ def belief(now: Prepared, step: int = 1) -> SwarmBelief:
         step=torch.full(shape, step),
         errors=now.model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
         past=window.begun(now.place, now.joint, 0),
+        delays=now.delays,
         batch_size=shape,
     )
 

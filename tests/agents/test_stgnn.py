@@ -14,6 +14,7 @@ from agents.checkpoint import untrained
 from agents.stgnn.features import SCALARS, Memory, forgotten, look
 from agents.stgnn.layers import DilatedConvolution, TopologicalAttention, carried_over
 from agents.stgnn.network import DILATIONS, StGnn
+from agents.swarm import delays
 from agents.swarm.belief import Found, Prepared
 from agents.swarm.calibration import believed_model
 from agents.swarm.links import Links, lengths, own_information
@@ -54,6 +55,7 @@ def moment(seed: int, reach: float = 900.0) -> tuple[Prepared, Found, Tensor, Te
         joint=variance.new_zeros(2, N, 1, 0),
         between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
         drift=None,
+        delays=delays.begun(place, None),
         chain=believed_chain(torch.full((2,), 0.1, dtype=torch.float64)),
         added=torch.full((2, N), 0.3, dtype=torch.float64),
         fixed=fixed,

@@ -395,7 +395,7 @@ def test_gauss_newton_is_scipys_least_squares() -> None:
     world = {name: x[:1] for name, x in team(7).items()}
     fixed, free = world["fixed"], ~world["fixed"][0]
     precision = torch.diag_embed(world["trust"].repeat_interleave(3, -1))
-    found, information = gauss_newton(
+    found, _, information = gauss_newton(
         world["prior"],
         world["distance"],
         lambda residual: weights.plain(residual, world["mask"], STD),
