@@ -17,7 +17,8 @@ BESIDE = (
     *("cspf:broadcast=true", "cspf:outliers=0.4", "pf_joint", "pf_joint:particles=5000"),
     *("pf_joint:anneal=0.96:particles=50", "pose_graph:every=50:robust=gnc"),
 )
-LITERAL = ("cspf:variant=paper", "cspf:variant=paper_corrected", "cspf:variant=neighbourhood")
+LITERAL = ("cspf:variant=paper", "cspf:variant=paper_corrected")
+ACROSS = ("cspf", "cspf:variant=neighbourhood")  # eq. 16 in this filter: thirty times as dear
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 PUBLISHED = 0.2
 EARLY, LATE = 150, 250  # steps after which convergence is looked at
@@ -55,8 +56,13 @@ def teams(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
 
 
 def clouds(steps: int | None) -> tuple[Variant, tuple[str, ...]]:
-    """More and fewer particles."""
-    return published(2, steps), tuple(f"cspf:particles={m}" for m in PARTICLES)
+    """More and fewer particles, and the paper's own target."""
+    return published(2, steps), (*(f"cspf:particles={m}" for m in PARTICLES), *ACROSS)
+
+
+def few(runs: int) -> int:
+    """Runs of what is dear."""
+    return max(1, runs // 10)
 
 
 def hard(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:

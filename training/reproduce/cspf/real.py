@@ -61,11 +61,6 @@ def planned(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
     ]
 
 
-def runs_in(runs: int) -> int:
-    """A tenth: of a recording only what is drawn differs."""
-    return max(1, runs // 10)
-
-
 def verdicts(found: Found, steps: int | None) -> list[Verdict]:
     """Section 6's claim that a filter stays bounded where dead reckoning drifts, and whether what
     the paper says of particles and of consensus holds on recordings, where agents were flown."""

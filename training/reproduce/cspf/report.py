@@ -84,9 +84,9 @@ def beyond_part(study: Study, runs: int, steps: int | None) -> Text:
     """The study beyond the paper; its lines for the report."""
     text = ["## Beyond the paper", ""]
     variant, agents = plan.clouds(steps)
-    there = runs_of(study, variant, agents, plan.runs_in(variant, runs))
+    there = runs_of(study, variant, agents, plan.few(runs))
     if there:
-        text += titled_table("Particles", tables.figures({variant.title: there}))
+        text += titled_table("Particles, and eq. 16", tables.figures({variant.title: there}))
     for title, planned in (
         ("Larger teams", plan.teams(steps)),
         ("Where many modes persist", plan.hard(steps)),
@@ -98,7 +98,7 @@ def beyond_part(study: Study, runs: int, steps: int | None) -> Text:
 
 def real_part(study: Study, runs: int, steps: int | None) -> Text:
     """Recordings; the part's lines for the report."""
-    count = real.runs_in(runs)
+    count = plan.few(runs)
     found = {v: runs_of(study, v, (WORLD, *a), count) for v, a in real.planned(steps)}
     judged = real.verdicts({v.key: there for v, there in found.items()}, steps)
     text = ["## Recordings", "", reporting.counts(judged), "", *reporting.claims(judged), ""]

@@ -57,8 +57,9 @@ def _plan(own: bool, beyond: bool, recorded: bool, runs: int, steps: int | None)
             planned.append((plan.published(dim, steps), beside, runs))
         planned += [(variant, agents, runs) for variant, agents in plan.shares(steps)]
     if beyond:
-        for variant, agents in (plan.clouds(steps), *plan.teams(steps), *plan.hard(steps)):
+        planned.append((*plan.clouds(steps), plan.few(runs)))
+        for variant, agents in (*plan.teams(steps), *plan.hard(steps)):
             planned.append((variant, agents, plan.runs_in(variant, runs)))
     if recorded:
-        planned += [(v, agents, real.runs_in(runs)) for v, agents in real.planned(steps)]
+        planned += [(v, agents, plan.few(runs)) for v, agents in real.planned(steps)]
     return planned
