@@ -15,6 +15,7 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import register
 from agents.swarm import joint, window
+from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.majorization import pull, require_iterations
@@ -26,7 +27,7 @@ _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
 _RELAXED = 1.8  # of a Guttman step, which overestimates how much many ranges hold together
 
 
-@register("dwmds_st")
+@register("dwmds_st", suited)
 class DynamicMds(SwarmFilter):
     """Whole-team stress majorization with a recursive prior from dead reckoning.
 

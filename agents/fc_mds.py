@@ -14,6 +14,7 @@ from torch import Tensor
 
 from agents.localizer import register
 from agents.mds import MdsMap
+from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
 from agents.swarm.links import connected, lengths
 from agents.swarm.majorization import RELAXED, descent, repeated, require_iterations
@@ -21,7 +22,7 @@ from agents.swarm.spread import spread, told
 from coloc_env.scenario import Believed
 
 
-@register("fcmds")
+@register("fcmds", suited)
 class FullyConnectedMds(MdsMap):
     """Majorization in which every pair of a connected part counts alike: measured distances stay,
     missing ones are read off the map anew in every iteration. UAVs with fixes stay; no prior.

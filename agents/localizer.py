@@ -50,11 +50,6 @@ class Localizer(ABC, Generic[Belief]):
     def __init__(self, believed: Believed) -> None:
         self.believed = believed
 
-    @classmethod
-    def suited(cls, believed: Believed, **chosen: Any) -> "Localizer":
-        """What ``make`` builds: one of these, or what makes one fit for such a team."""
-        return cls(believed, **chosen)
-
     @abstractmethod
     def reset(self, observation: Observation) -> Belief:
         """The belief before the first observation is used: the prior that it carries."""
@@ -113,14 +108,18 @@ class Localizer(ABC, Generic[Belief]):
 
 Factory = Callable[..., Localizer]
 LOCALIZERS: dict[str, Factory] = {}
+_SUITED: dict[str, Factory] = {}
 _L = TypeVar("_L", bound=Factory)
 
 
-def register(name: str) -> Callable[[_L], _L]:
-    """Register a localizer: a callable of ``believed`` and keyword-only options."""
+def register(name: str, suited: Callable[[Factory], Factory] | None = None) -> Callable[[_L], _L]:
+    """Register a localizer: a callable of ``believed`` and keyword-only options. ``suited`` makes
+    of it one that builds what fits the team."""
 
     def add(factory: _L) -> _L:
         LOCALIZERS[name] = factory
+        if suited is not None:
+            _SUITED[name] = suited(factory)
         return factory
 
     return add
@@ -147,10 +146,8 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
         chosen[key] = value
     options.check(name, chosen, known)
     believed = scenario if isinstance(scenario, Believed) else scenario.believed
-    factory = LOCALIZERS[name]
-    build: Callable[..., Localizer[Any]] = getattr(factory, "suited", factory)
     try:
-        return build(believed, **chosen)
+        return _SUITED.get(name, LOCALIZERS[name])(believed, **chosen)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from agents.localizer import register
 from agents.swarm import delays, joint
+from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.gauss_newton import coordinates, gauss_newton, informed
@@ -59,7 +60,7 @@ class _Joint(SwarmFilter):
         return Found(position, joint.variances(together), together, delays=learned)
 
 
-@register("gn")
+@register("gn", suited)
 class Snapshot(_Joint):
     """Gauss–Newton on the ranges of one step, started where dead reckoning is. ``confidence``:
     ``huber``, ``em`` or ``none``, as ``dwmds_st`` has it."""
@@ -76,7 +77,7 @@ class Snapshot(_Joint):
         return self.solved(now, torch.zeros_like(belief.joint.flatten(1, 2)))
 
 
-@register("map")
+@register("map", suited)
 class RecursiveMap(_Joint):
     """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
     ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does not

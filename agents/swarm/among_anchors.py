@@ -7,6 +7,8 @@ members of the team that know where they are.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float64, Int64
@@ -14,12 +16,12 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.ekf import elapsed
-from agents.localizer import Estimate, Localizer
+from agents.localizer import Estimate, Factory, Localizer
 from agents.models.process import make_process
 from agents.swarm import joint
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.centres import Centres
-from agents.swarm.filter import SwarmFilter
+from agents.swarm.filter import SwarmFilter, is_plain
 from agents.swarm.links import Links
 from agents.swarm.reckoning import Reckoning, apart, informed, matched
 from agents.tensorclasses import build
@@ -52,7 +54,7 @@ class AmongAnchors(Localizer[AmongBelief]):
     name = "among_anchors"
     centralized = True
 
-    def __init__(self, believed: Believed, method: Callable[[Believed], SwarmFilter]) -> None:
+    def __init__(self, believed: Believed, method: Callable[[Believed], Localizer[Any]]) -> None:
         """Raises ValueError where UAVs have no ranges between them, their motion model lacks its
         sensor, or the method keeps a window of steps."""
         super().__init__(believed)
@@ -64,7 +66,9 @@ class AmongAnchors(Localizer[AmongBelief]):
         self.centres = Centres(believed, ranging)
         self.fixed = believed.sensor(PositionFix)
         fixes = self.fixed or PositionFix(_SURVEYED)
-        self.swarm, self.variance = method(self._team(ranging, fixes)), fixes.std**2
+        swarm = method(self._team(ranging, fixes))
+        assert isinstance(swarm, SwarmFilter)
+        self.swarm, self.variance = swarm, fixes.std**2
         if self.swarm.window:
             raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
@@ -201,6 +205,17 @@ class AmongAnchors(Localizer[AmongBelief]):
         told = self.swarm.told(weight, now)
         seen = informed(own, found.position, told, now.variance)
         return torch.where(now.fixed[:, :n, None, None], block, seen)
+
+
+def suited(method: Factory) -> Factory:
+    """Builds a swarm filter or, for teams that are not plain, what makes one fit for them."""
+
+    def build(believed: Believed, **chosen: Any) -> Localizer[Any]:
+        if is_plain(believed):
+            return method(believed, **chosen)
+        return AmongAnchors(believed, partial(method, **chosen))
+
+    return build
 
 
 def _at_rest(

@@ -2,8 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import replace
-from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float64
@@ -12,7 +11,16 @@ from torch import Tensor
 from agents.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
-from agents.swarm import calibration, delays, drift, joint, persistence, weights, window
+from agents.swarm import (
+    calibration,
+    delays,
+    drift,
+    joint,
+    obstruction,
+    persistence,
+    weights,
+    window,
+)
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.drift import Drift
 from agents.swarm.links import Links, connected, lengths, links_of
@@ -23,7 +31,6 @@ from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import AnchorRanging, Ins, PositionFix, Ranging
 
 Confidence = Literal["none", "huber", "em", "paper"]
-_ENOUGH = 50.0  # remembered errors of links between fixes: with fewer, all links' are learned from
 
 
 class SwarmFilter(Localizer[SwarmBelief]):
@@ -65,15 +72,6 @@ class SwarmFilter(Localizer[SwarmBelief]):
         self.clock = (
             clock if delays and clock is not None and clock.offset + clock.skew > 0 else None
         )
-
-    @classmethod
-    def suited(cls, believed: Believed, **chosen: Any) -> Localizer:
-        """One of these; inside ``AmongAnchors`` for teams that are not plain."""
-        if is_plain(believed):
-            return cls(believed, **chosen)
-        from agents.swarm.among_anchors import AmongAnchors  # which is made of this module
-
-        return AmongAnchors(believed, partial(cls, **chosen))
 
     @abstractmethod
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
@@ -164,7 +162,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             past=self._past(belief, place, kept, added, fixed, spread, dt),
         )
         if self.confidence == "em":
-            return self._learned(belief, now)
+            return obstruction.learned(now, belief.memory, self.std, self.dense)
         if self.confidence == "paper":
             heard = (~links.mask).double()
             silent = belief.memory + (heard - belief.memory) / calibration.FORGET
@@ -298,52 +296,13 @@ class SwarmFilter(Localizer[SwarmBelief]):
             window.fading(self.decay, dt),
         )
 
-    def _learned(self, belief: SwarmBelief, now: Prepared) -> Prepared:
-        """The same with the error model after this step's links between those who know where they
-        are, how these change, and how likely each link is obstructed. Where such links are few, but
-        links ``dense``, all others count besides, with what is unsure of their ends."""
-        links, std = now.links, self.std
-        guides = now.fixed.any(0).nonzero()[:, 0]
-        known = links.mask & now.fixed.unsqueeze(-1) & now.fixed.unsqueeze(-2)
-        remembered = 0.5 * calibration.FORGET * known.sum((-2, -1))
-        others = self.dense * (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
-        if bool((others > 0).any()):
-            guides = torch.arange(links.mask.shape[-1], device=guides.device)
-        rows, columns = guides.unsqueeze(-1), guides
-
-        def part(x: Tensor) -> Tensor:
-            return torch.triu(x[:, rows, columns], 1).flatten(1)
-
-        counts = part(torch.where(known, 1.0, others) * links.mask)
-        error, unsure = part(links.distance - lengths(now.place)), part(now.between)
-        model = calibration.learned(now.model, error, counts, unsure, std)
-        share = model.share[:, 1]
-        chain = persistence.learned(
-            now.chain,
-            part(belief.memory),
-            calibration.outlier_evidence(model, error, unsure, std),
-            counts,
-            share,
-        )
-        rho = persistence.persistence(chain)
-        outlier = persistence.forecast(belief.memory.flatten(1), rho, share)
-        return replace(now, model=model, chain=chain, outlier=outlier.view_as(belief.memory))
-
     def _remembered(
         self, belief: SwarmBelief, now: Prepared, found: Found
     ) -> Float64[Tensor, "B N L"]:
         """What goes on of each link."""
-        if now.outlier is None:
-            return belief.memory if now.silent is None else now.silent
-        residual = now.links.distance - lengths(found.position.detach())
-        unsure = now.between if found.joint is None else joint.between(found.joint)
-        if self.clock is not None and found.delays is not None:
-            residual = residual - delays.added(found.delays.delay - now.delays.delay)
-            unsure = unsure + delays.unsure(found.delays)
-        seen = calibration.outlier_probability(
-            now.model, residual.flatten(1), unsure.flatten(1), self.std, now.outlier.flatten(1)
-        )
-        return torch.where(now.links.mask, seen.view_as(residual), now.outlier)
+        if now.outlier is not None:
+            return obstruction.seen(now, found, now.outlier, self.std)
+        return belief.memory if now.silent is None else now.silent
 
 
 def is_plain(believed: Believed) -> bool:
