@@ -255,6 +255,7 @@ def as_the_paper_says() -> Told:
         plan.LEARNED: flown(70.0, noise=1.0),
         OPTIMIZER: flown(40.0),
         plan.HUBER: flown(40.0),
+        plan.OPEN: flown(38.0),
         plan.UNFED: flown(40.0),
         plan.PAPERS_FEEDBACK: flown(30.0),
         plan.CLOSED_AFTERWARDS: flown(39.0),

@@ -16,13 +16,19 @@ POSTERIOR, SNAPSHOT = BOUNDS
 # Step by step from the optimizer to the whole, each with weights trained as it is flown.
 ABLATION = {
     OPTIMIZER: "DW-MDS alone",
-    "stdcl:weights=stdcl_attention:feedback=none": "+ attention",
-    "stdcl:weights=stdcl_open:feedback=none": "+ convolutions",
-    WHOLE: "+ feedback: whole",
+    "stdcl:weights=stdcl_attention": "+ attention, fed back",
+    WHOLE: "+ convolutions: whole",
 }
+OPEN = "stdcl:weights=stdcl_open:feedback=none"  # trained with the loop open, flown so
 UNFED = "stdcl:feedback=none"  # the whole's own weights, with the loop cut
 PAPERS_FEEDBACK = "stdcl:feedback=paper"
-CLOSED_AFTERWARDS = "stdcl:weights=stdcl_open:feedback=positions"  # trained with the loop open
+CLOSED_AFTERWARDS = "stdcl:weights=stdcl_open:feedback=positions"
+LOOPS = {
+    OPEN: "trained without feedback",
+    UNFED: "whole, loop cut",
+    PAPERS_FEEDBACK: "whole, feedback of eq. 36",
+    CLOSED_AFTERWARDS: "trained without, positions fed back",
+}
 CONFIDENCES = ("none", "paper", "huber")  # beside the optimizer's own, calibrated
 
 FAST, MODERATE, SLOW = 100.0, 50.0, 10.0  # v_max in m/s
@@ -253,7 +259,7 @@ class Plan:
 
     def learned(self) -> list[Scene]:
         """What each part of the network adds, what the loop does, and whether it is stable."""
-        agents = (HUBER, *ABLATION, UNFED, PAPERS_FEEDBACK, CLOSED_AFTERWARDS)
+        agents = (HUBER, *ABLATION, *LOOPS)
         where = [self.speed(MODERATE), *self.held_out().values()]
         found = [Scene(v, agents, self.some) for v in where]
         return [*found, Scene(self.long(), (OPTIMIZER, WHOLE, UNFED), self.some)]

@@ -12,7 +12,7 @@ from training.reproduce.reporting import Text, section
 from training.reproduce.stdcl import figures, goals, loop_figures, plan, stress_figures, tables
 from training.reproduce.stdcl.claims import verdicts as judge
 from training.reproduce.stdcl.flown import Flown, Teams
-from training.reproduce.stdcl.plan import ABLATION, METHODS, OPTIMIZER, REFERENCES, WHOLE, Plan
+from training.reproduce.stdcl.plan import METHODS, OPTIMIZER, REFERENCES, WHOLE, Plan
 from training.reproduce.study import BOUNDS, WORLD
 
 FILES = (
@@ -152,12 +152,7 @@ def learned_part(flown: Flown, the: Plan, folder: Path) -> Text:
     there = flown.runs(the.long().key)
     drawings: Drawings = {}
     if found:
-        agents = ABLATION | {
-            plan.UNFED: "whole, loop cut",
-            plan.PAPERS_FEEDBACK: "whole, feedback of eq. 36",
-            plan.CLOSED_AFTERWARDS: "trained open, positions fed back",
-        }
-        drawings[FILES[9]] = partial(loop_figures.ablation, found, agents)
+        drawings[FILES[9]] = partial(loop_figures.ablation, found, plan.ABLATION | plan.LOOPS)
     if there:
         drawings[FILES[10]] = partial(loop_figures.long_run, _only(there), flown.loop)
     text = ["## The learned part", "", f"INS bias 0.3 m/s, 15 % NLOS, {the.some} runs.", ""]

@@ -101,9 +101,7 @@ def ablation(scenes: Sequence[Scene], flown: Flown) -> Table:
     """What each part of the network changes, paired by world, against the optimizer alone."""
     header = ["worlds", "agent", "what it has", "RMSE (m)", "better than DW-MDS alone (%)"]
     header += ["better than the line above (%)"]
-    names = {plan.HUBER: "DW-MDS alone, Huber"} | plan.ABLATION
-    names |= {plan.UNFED: "whole, loop cut", plan.PAPERS_FEEDBACK: "whole, feedback of eq. 36"}
-    names |= {plan.CLOSED_AFTERWARDS: "trained open, positions fed back"}
+    names = {plan.HUBER: "DW-MDS alone, Huber"} | plan.ABLATION | plan.LOOPS
     lines = []
     for scene in scenes:
         there = flown.runs(scene.variant.key)
