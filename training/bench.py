@@ -7,7 +7,6 @@ slows all alike; the figure is the best round, the median beside it tells how no
 import json
 import math
 import platform
-import shutil
 import statistics
 import subprocess
 import sys
@@ -16,29 +15,22 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from agents import LOCALIZERS, make
-from agents.hybrid import HybridFilter
-from coloc_env.scenarios import make_scenario
+from training.bench_agents import TITLES, time_agents
 from training.bench_cases import Case, Timed, cases
 from training.bench_figures import FIGURES, draw
 from training.bench_learning import learning_cases
-from training.bench_parts import PROFILED, step_parts
 from training.bench_peers import peers
-from training.evaluate import ms_per_step
 from training.staging import staged_folder
 
 T = TypeVar("T")
 NAMES = (*FIGURES, "bench.json")
-PARTICLES = (100, 300, 1000, 3000)
-TEAMS = (2, 6, 12, 24)
-COMPILED = ("pf800:compile=true", "pfnn:compile=true")
 _RATIOS = {  # ours to theirs, six agents each
     "PettingZoo / mpe2": ("PettingZoo N=6", "mpe2 simple_spread B=1"),
     "World / VMAS, B=1": ("World B=1", "VMAS simple_spread B=1"),
@@ -78,13 +70,13 @@ def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:
 
     ``environments``: per case the best and the median round in agent-steps per second, and the best
     round's ms per step; ``ratios`` to peers where they are installed; ``memory_mb``: how much the
-    process grows for 1024 worlds; ``agents``, ``particles``, ``teams``: a team's step in ms;
-    ``parts``: where it goes, in ms by part.
+    process grows for 1024 worlds; ``agents``, ``swarms``, ``relative``, ``particles``, ``teams``: a
+    team's step in ms; ``parts``: where it goes, in ms by part.
     """
     with _one_thread():
         chosen = [*cases(), *learning_cases(), *peers()]
         environments = _rounds(chosen, 1 if quick else 15)
-        localizers = _localizers(quick) if agents else {}
+        localizers = time_agents(quick, _track) if agents else {}
     best = {name: figures["agent_steps_per_s"] for name, figures in environments.items()}
     return {
         "machine": {
@@ -121,7 +113,7 @@ def show(results: dict[str, Any]) -> None:
     if results["memory_mb"] is not None:
         ratios.append(("memory of 1024 worlds", f"{results['memory_mb']:.0f} MB"))
     console.print(_table(("", "ratio"), ratios), highlight=False)
-    for key, title in (("agents", "agent"), ("particles", "particles"), ("teams", "UAVs")):
+    for key, title in TITLES.items():
         lines = [(name, _ms(ms)) for name, ms in results.get(key, {}).items()]
         if lines:
             console.print(_table((title, "ms a team's step"), lines), highlight=False)
@@ -169,30 +161,6 @@ def _seconds(case: Case, timed: Timed) -> float:
     start = time.perf_counter()
     timed.run(steps)
     return (time.perf_counter() - start) / steps
-
-
-def _localizers(quick: bool) -> dict[str, Any]:
-    """A team's step in ms: every localizer, and a particle filter by particles and team size."""
-    tasks: list[tuple[str, str, str, int]] = [("agents", name, name, 6) for name in LOCALIZERS]
-    if "pf800" in LOCALIZERS:
-        tasks += [("particles", str(m), f"pf800:particles={m}", 6) for m in PARTICLES]
-        tasks += [("teams", str(n), "pf800", n) for n in TEAMS]
-    if shutil.which("c++") or shutil.which("g++"):
-        tasks += [("agents", name, name, 6) for name in COMPILED]
-    found: dict[str, dict[str, float | None]] = {"agents": {}, "particles": {}, "teams": {}}
-    chosen = tasks[:1] if quick else tasks
-    for group, key, agent, n in _track(chosen, "agents"):
-        scenario = make_scenario("indoor-v0", n_uavs=n, anchors=4 * _needs_anchors(agent))
-        found[group][key] = ms_per_step(make(agent, scenario), scenario, 0)
-    scenario = make_scenario("indoor-v0")
-    profiled = PROFILED[:1] if quick else PROFILED
-    parts = {name: step_parts(make(name, scenario), scenario) for name in profiled}
-    return found | {"parts": parts}
-
-
-def _needs_anchors(agent: str) -> bool:
-    """Whether an agent refuses a team without anchors."""
-    return issubclass(cast(type, LOCALIZERS[agent.split(":")[0]]), HybridFilter)
 
 
 def _track(items: Sequence[T], what: str) -> Iterable[T]:

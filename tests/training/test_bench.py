@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 import torch
 
-from agents import make, pf
+from agents import LOCALIZERS, make, pf
 from agents.particles import renewal
 from coloc_env.scenarios import make_scenario
 from training.bench import NAMES, bench
+from training.bench_agents import TITLES, Task, tasks
 from training.bench_parts import REST, Stopwatch, _watching, step_parts
 
 
@@ -32,6 +33,17 @@ def test_a_quick_benchmark_writes_numbers_and_figures(
     printed = capsys.readouterr().out
     assert "PettingZoo N=200" in printed
     assert "memory of 1024 worlds" in printed
+
+
+@pytest.mark.parametrize("task", tasks(), ids=lambda task: f"{task.group}-{task.key}")
+def test_every_localizer_is_timed_where_it_can_be(task: Task) -> None:
+    localizer = make(task.agent, make_scenario(task.scenario, **dict(task.overrides)))
+    assert task.group in TITLES
+    assert localizer.believed.arena.n_uavs > 1
+
+
+def test_no_localizer_is_left_out() -> None:
+    assert {task.agent.split(":")[0] for task in tasks()} == set(LOCALIZERS)
 
 
 def test_an_unwritable_folder_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
