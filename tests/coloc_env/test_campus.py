@@ -1,6 +1,7 @@
 """``campus-v0``: the building between UAVs, clocks, the three flights, and who is cut off when."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from coloc_env.network import Network
 from coloc_env.parallel import parallel_env
 from coloc_env.reference import SatelliteReference
 from coloc_env.render import Renderer
-from coloc_env.scenario import InsDriven
+from coloc_env.scenario import InsDriven, Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.scenarios.campus import BUILDING, COURT, SIZE
 from coloc_env.sensors import Clock, Ins, PositionFix, RangeNoise, Ranging
@@ -44,17 +45,6 @@ TROUBLE: dict[str, Any] = {
     "failure_rate": 0.3,
     "wall_loss": 0.5,
 }
-
-
-def flown(steps: int, seeds: list[int], window: int | None = None, **overrides: Any) -> Tensor:
-    """Positions [K, B, N, 3] and every leaf, side by side [K, B, N, F]."""
-    world, told = World(make_scenario("campus-v0", **overrides), len(seeds), window=window), []
-    seen, n = world.reset(seeds), world.scenario.arena.n_uavs
-    for k in range(steps):
-        told.append(torch.cat((world.truth.position, *seen.leaves.values()), -1))
-        world.advance(torch.full((len(seeds), n, 9), float(k)))
-        seen = world.observation()
-    return torch.stack(told)
 
 
 def path(flight: str, worlds: int, dt: float = 0.1, seconds: float | None = None) -> Kinematics:
@@ -417,12 +407,10 @@ def test_both_faces_work(overrides: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(flight: str) -> None:
-    seeds, overrides = [5, 0, 9, 2**40, 7], TROUBLE | {"flight": flight, "dt": 0.5}
-    together = flown(90, seeds, **overrides)
-    for row, window in ((0, 1), (3, 7), (4, 64)):
-        alone = flown(90, seeds[row : row + 1], window, **overrides)
-        assert torch.equal(alone, together[:, row : row + 1])
+def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(
+    flight: str, rows_are_their_own_worlds: Callable[[Scenario, int], None]
+) -> None:
+    rows_are_their_own_worlds(make_scenario("campus-v0", flight=flight, dt=0.5, **TROUBLE), 90)
 
 
 def test_rows_that_are_reset_alone_are_worlds_of_their_seeds() -> None:

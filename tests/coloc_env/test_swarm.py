@@ -1,13 +1,13 @@
 """``swarm-v0``: the box and its layouts, who is scored, and ranges as the ST-DCL paper has them."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from pettingzoo.test import parallel_api_test, parallel_seed_test
-from torch import Tensor
 from torchrl.envs import check_env_specs
 
 from coloc_env import noise
@@ -16,7 +16,7 @@ from coloc_env.bounds import posterior_bound
 from coloc_env.motion import Kinematics
 from coloc_env.observation import action_bounds, all_leaves
 from coloc_env.parallel import CoLocParallelEnv, parallel_env
-from coloc_env.scenario import REWARDS, InsDriven
+from coloc_env.scenario import REWARDS, InsDriven, Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging
 from coloc_env.world import World
@@ -34,17 +34,6 @@ TROUBLE: dict[str, Any] = {
     "message_loss": 0.1,
     "failure_rate": 0.3,
 }
-
-
-def flown(steps: int, seeds: list[int], window: int | None = None, **overrides: Any) -> Tensor:
-    """Positions [K, B, N, 3] and every leaf, side by side [K, B, N, F]."""
-    world, told = World(make_scenario("swarm-v0", **overrides), len(seeds), window=window), []
-    seen, n = world.reset(seeds), world.scenario.arena.n_uavs
-    for k in range(steps):
-        told.append(torch.cat((world.truth.position, *seen.leaves.values()), -1))
-        world.advance(torch.full((len(seeds), n, 9), float(k)))
-        seen = world.observation()
-    return torch.stack(told)
 
 
 # ---------------------------------------------------------------- as published
@@ -320,12 +309,10 @@ def test_the_truth_as_an_action_costs_nothing_over_the_whole_path() -> None:
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(motion: str) -> None:
-    seeds = [5, 0, 9, 2**40, 7]
-    together = flown(90, seeds, motion=motion, **TROUBLE)
-    for row, window in ((0, 1), (3, 7), (4, 64)):
-        alone = flown(90, seeds[row : row + 1], window, motion=motion, **TROUBLE)
-        assert torch.equal(alone, together[:, row : row + 1])
+def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(
+    motion: str, rows_are_their_own_worlds: Callable[[Scenario, int], None]
+) -> None:
+    rows_are_their_own_worlds(make_scenario("swarm-v0", motion=motion, **TROUBLE), 90)
 
 
 def test_rows_that_are_reset_alone_are_worlds_of_their_seeds() -> None:
