@@ -21,13 +21,13 @@ from agents.models.process import make_process
 from agents.swarm import joint
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.centres import Centres
-from agents.swarm.filter import SwarmFilter, is_plain
+from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import Links
 from agents.swarm.reckoning import Reckoning, apart, informed, matched
 from agents.tensorclasses import build
 from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import Ins, PositionFix, Ranging
+from coloc_env.sensors import AnchorRanging, Ins, PositionFix, Ranging
 
 _SURVEYED = 1e-3  # m: how well anchors' places are known, per axis
 
@@ -205,6 +205,14 @@ class AmongAnchors(Localizer[AmongBelief]):
         told = self.swarm.told(weight, now)
         seen = informed(own, found.position, told, now.variance)
         return torch.where(now.fixed[:, :n, None, None], block, seen)
+
+
+def is_plain(believed: Believed) -> bool:
+    """Whether a team has ranges between centres alone, and positions that velocities move."""
+    ranging = believed.sensor(Ranging)
+    lever_arms = ranging is not None and ranging.tags
+    process = make_process(believed)
+    return not (lever_arms or believed.sensor(AnchorRanging) or process.error_size > process.dim)
 
 
 def suited(method: Factory) -> Factory:

@@ -28,7 +28,7 @@ from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import AnchorRanging, Ins, PositionFix, Ranging
+from coloc_env.sensors import Ins, PositionFix, Ranging
 
 Confidence = Literal["none", "huber", "em", "paper"]
 
@@ -57,13 +57,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
         ``delays``: estimate what antennas add to ranges, where it believes that they do."""
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
-        if sensor is None:
-            raise ValueError("a team with ranges between UAVs is needed")
-        if not is_plain(believed):
-            raise ValueError(
-                "a team without fixed anchors and lever arms, and with motion that is no more than "
-                "a position, is needed"
-            )
+        if sensor is None or sensor.tags:
+            raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.confidence = confidence
         ins = believed.sensor(Ins) if isinstance(believed.process, InsDriven) else None
@@ -303,14 +298,6 @@ class SwarmFilter(Localizer[SwarmBelief]):
         if now.outlier is not None:
             return obstruction.seen(now, found, now.outlier, self.std)
         return belief.memory if now.silent is None else now.silent
-
-
-def is_plain(believed: Believed) -> bool:
-    """Whether a team has ranges between centres alone, and positions that velocities move."""
-    ranging = believed.sensor(Ranging)
-    lever_arms = ranging is not None and ranging.tags
-    process = make_process(believed)
-    return not (lever_arms or believed.sensor(AnchorRanging) or process.error_size > process.dim)
 
 
 def _for_each(x: Float64[Tensor, "B *s"], shape: torch.Size) -> Float64[Tensor, "B N *s"]:

@@ -187,9 +187,9 @@ def test_options_reach_the_swarm_filter() -> None:
     assert among.swarm.iterations == 7
 
 
-def test_the_graph_network_refuses_them() -> None:
-    with pytest.raises(ValueError, match="without fixed anchors and lever arms"):
-        StDcl(make_scenario("indoor-v0", anchors=8).believed, weights="none")
+def test_the_graph_network_refuses_lever_arms(tools: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match="ranges between UAVs, without lever arms, is needed"):
+        StDcl(tools.families["tags"]().believed, weights="none")
 
 
 def test_without_ranges_between_uavs_it_says_so() -> None:

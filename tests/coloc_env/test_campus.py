@@ -322,7 +322,7 @@ def test_the_campus_is_as_documented() -> None:
     own = (Ins(0.3, 0.2, 60.0), PositionFix(0.1, 3))
     ranging = Ranging(RangeNoise(0.2), walls=(BUILDING,), excess=0.08, clock=Clock(0.2, 0.1))
     assert scenario.sensors == (*own, ranging)
-    assert scenario.believed.sensors == (*own, Ranging(RangeNoise(std=0.2)))
+    assert scenario.believed.sensors == (*own, Ranging(RangeNoise(std=0.2), clock=Clock(0.2, 0.1)))
     assert scenario.believed.process == InsDriven(20.0)
     # Concrete by ITU-R P.2040-1, eq. 31: 1636 σ / √ε dB/m, σ = 0.0326 f^0.8095 S/m at f GHz.
     attenuation = 1636 * 0.0326 * 4**0.8095 / math.sqrt(5.31)

@@ -35,7 +35,7 @@ def test_a_quick_benchmark_writes_numbers_and_figures(
     assert "memory of 1024 worlds" in printed
 
 
-@pytest.mark.parametrize("task", tasks(), ids=lambda task: f"{task.group}-{task.key}")
+@pytest.mark.parametrize("task", list(tasks()), ids=lambda task: f"{task.group}-{task.key}")
 def test_every_localizer_is_timed_where_it_can_be(task: Task) -> None:
     localizer = make(task.agent, make_scenario(task.scenario, **dict(task.overrides)))
     assert task.group in TITLES

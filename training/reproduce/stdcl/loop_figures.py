@@ -17,7 +17,7 @@ from training.reproduce.stdcl.tables import spread
 from training.reproduce.study import WORLD
 from training.reproduce.verdicts import interval
 
-_PARTED = (plan.WHOLE, plan.OPTIMIZER, "dwmds", "vmds", WORLD)
+_PARTED = (plan.WHOLE, plan.OPTIMIZER, "map", "dwmds", "vmds", WORLD)
 _SHOWN = 8.0  # s before and after an event
 _STEPS = ("#bdbdbd", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#332288", "#999999")
 
