@@ -71,7 +71,8 @@ class SteinFilter(RelativeTeam[SteinBelief]):
     """Stein particles of the team's poses, one cloud a UAV, that agree by consensus.
 
     ``particles`` a UAV (one: annealed Gauss–Newton), ``iterations`` a step, ``window``: matches
-    remembered. ``gamma``, ``eta``: penalty and step of the consensus; ``repulsion`` and ``pace`` of
+    remembered. ``gamma``: penalty of the consensus, shared by a UAV's edges (each with one of its
+    own, a large team would listen to nothing else), ``eta`` its step; ``repulsion`` and ``pace`` of
     the Stein step; ``anneal``: by what factor the scale of matches shrinks in a step; a holder
     whose matches are inliers to a share below ``restart`` begins anew. ``outliers``: share of wrong
     matches believed. ``broadcast=true`` tells a match to all that hear its first end.
@@ -88,7 +89,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         particles: int = 50,
         iterations: int = 2,
         window: int = 30,
-        gamma: float = 0.5,
+        gamma: float = 1.0,
         eta: float = 1.0,
         repulsion: float = 0.1,
         pace: float = 0.5,
@@ -117,7 +118,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
                 raise ValueError(f"{key}={size} is not allowed: a number ≥ 0")
         self.particles, self.iterations, self.seed = particles, iterations, seed
         self.window = self.matches.matches if literal else window
-        self.gamma, self.pace = gamma, pace
+        self.gamma, self.pace = gamma / max(1, believed.arena.n_uavs - 1), pace
         self.repulsion = repulsion if particles > 1 else 0.0  # of itself, by rounding: up to 1e-5 m
         self.eta = -eta if variant == "paper" else eta
         self.restart = 0.0 if literal else restart

@@ -47,6 +47,13 @@ def test_teams_find_each_other(name: str, agent: str, steps: int) -> None:
     assert converged(name, agent, 6, steps).sum() >= 5
 
 
+def test_ten_share_the_penalty_and_find_each_other() -> None:
+    ten = {"n_uavs": 10, "matches_per_step": 3}
+    assert converged("stein2d-v0", "cspf:particles=1", 6, 100, **ten).sum() >= 5
+    each_its_own = "cspf:particles=1:gamma=9"
+    assert converged("stein2d-v0", each_its_own, 6, 100, **ten).sum() <= 3
+
+
 def test_a_plain_bootstrap_filter_does_not() -> None:
     assert converged("stein2d-v0", "pf_joint", 6, 130).sum() <= 1
 
