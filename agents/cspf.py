@@ -94,7 +94,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         repulsion: float = 0.1,
         pace: float = 0.5,
         anneal: float = 0.96,
-        restart: float = 0.3,
+        restart: float = 0.1,
         outliers: float = 0.2,
         consensus: bool = True,
         broadcast: bool = False,

@@ -17,6 +17,7 @@ BESIDE = (
     *("cspf:broadcast=true", "cspf:outliers=0.4", "pf_joint", "pf_joint:particles=5000"),
     *("pf_joint:anneal=0.96:particles=50", "pose_graph:every=50:robust=gnc"),
 )
+CENTRAL = ("pf_joint:anneal=0.97:particles=500", "pose_graph:every=50:robust=gnc")  # hard worlds
 LITERAL = ("cspf:variant=paper", "cspf:variant=paper_corrected")
 ACROSS = ("cspf", "cspf:variant=neighbourhood")  # eq. 16 in this filter: thirty times as dear
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -66,17 +67,18 @@ def few(runs: int) -> int:
 
 
 def hard(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
-    """Where many modes persist, and particles might pay: half of all matches wrong among many, a
-    ring of equals, blurred matches, a sparse network."""
+    """Where many modes persist, and particles might pay: most matches wrong, half of them among
+    many, a ring of equals, blurred matches, a sparse network."""
     worlds: tuple[dict[str, Any], ...] = (
         {"outliers": 0.6},
+        {"outliers": 0.75},
         {"outliers": 0.5, "n_uavs": 10, "matches_per_step": 2},
         {"outliers": 0.5, "motion": "circle"},
         {"outliers": 0.4, "relative_pose_noise": (0.3, 15.0)},
         {"outliers": 0.4, "n_uavs": 6, "comm_radius": 5.0, "matches_per_step": 3},
         {"outliers": 0.4, "message_loss": 0.5},
     )
-    return [(world(2, steps, **each), METHODS) for each in worlds]
+    return [(world(2, steps, **each), (*METHODS, *CENTRAL)) for each in worlds]
 
 
 def runs_in(variant: Variant, runs: int) -> int:
