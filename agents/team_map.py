@@ -4,6 +4,8 @@ Gauss–Newton over the joint position of all UAVs, without a prior (``gn``) and
 covariance that dead reckoning has carried on (``map``).
 """
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -15,7 +17,10 @@ from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import Confidence, SwarmFilter
 from agents.swarm.gauss_newton import coordinates, gauss_newton, informed
 from agents.swarm.links import lengths
+from agents.swarm.obstruction import unsure
 from coloc_env.scenario import Believed
+
+_AGAIN = 3  # times that a first step is solved once more
 
 
 class _Joint(SwarmFilter):
@@ -37,10 +42,12 @@ class _Joint(SwarmFilter):
     def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N d K"]:
         return joint.independent(variance, self.process.dim)
 
-    def solved(self, now: Prepared, precision: Float64[Tensor, "B K K"]) -> Found:
+    def solved(
+        self, now: Prepared, precision: Float64[Tensor, "B K K"], start: Float64[Tensor, "B N d"]
+    ) -> Found:
         """Positions, and the inverse of their joint information."""
         position, late, _ = gauss_newton(
-            now.place,
+            start,
             now.links.distance,
             lambda residual: self.weigh_residual(residual, now),
             now.fixed,
@@ -74,14 +81,17 @@ class Snapshot(_Joint):
         super().__init__(believed, confidence, iterations)
 
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        return self.solved(now, torch.zeros_like(belief.joint.flatten(1, 2)))
+        return self.solved(now, torch.zeros_like(belief.joint.flatten(1, 2)), now.place)
 
 
 @register("map", suited)
 class RecursiveMap(_Joint):
     """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
     ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does not
-    estimate what clocks and antennas add to ranges."""
+    estimate what clocks and antennas add to ranges.
+
+    In the first step ranges are weighed anew by what is unsure of where UAVs are by then: a prior
+    of many noises' width cannot tell good ranges from bad."""
 
     name = "map"
 
@@ -99,4 +109,11 @@ class RecursiveMap(_Joint):
     def find(self, belief: SwarmBelief, now: Prepared) -> Found:
         whole = delays.whole(now.joint, now.delays)
         still = coordinates(now.fixed, self.process.dim, whole.shape[-1])
-        return self.solved(now, joint.held_by(whole, still))
+        known = joint.held_by(whole, still)
+        found = self.solved(now, known, now.place)
+        begins = (belief.step == 0).any(-1)[:, None, None]
+        for _ in range(_AGAIN if bool(begins.any()) else 0):
+            between = torch.where(begins, unsure(now, found), now.between)
+            now = replace(now, between=between)
+            found = self.solved(now, known, torch.where(begins, found.position, now.place))
+        return found

@@ -52,11 +52,20 @@ def seen(
     """How likely each link is obstructed once positions were found; as likely as before where there
     was no range."""
     residual = now.links.distance - lengths(found.position.detach())
-    unsure = now.between if found.joint is None else joint.between(found.joint)
     if found.delays is not None and found.delays.common.shape[-1]:
         residual = residual - delays.added(found.delays.delay - now.delays.delay)
-        unsure = unsure + delays.unsure(found.delays)
     after = calibration.outlier_probability(
-        now.model, residual.flatten(1), unsure.flatten(1), std, prior.flatten(1)
+        now.model, residual.flatten(1), unsure(now, found).flatten(1), std, prior.flatten(1)
     )
     return torch.where(now.links.mask, after.view_as(residual), prior)
+
+
+def unsure(now: Prepared, found: Found) -> Float64[Tensor, "B N N"]:
+    """Variance (m²) of every range that is foretold from what was found; as before where no joint
+    covariance is kept."""
+    if found.joint is None:
+        return now.between
+    between = joint.between(found.joint)
+    if found.delays is None or not found.delays.common.shape[-1]:
+        return between
+    return between + delays.unsure(found.delays)

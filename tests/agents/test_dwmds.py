@@ -58,6 +58,17 @@ def test_the_calibrated_ones_are_near_the_bound(results: Any) -> None:
     assert error(results, "dwmds_st") < 1.5 * bound
 
 
+def test_the_first_step_tells_good_ranges_from_bad() -> None:
+    """Half of all ranges with 50 m of noise, a start that is 90 m off: within the bound's reach."""
+    overrides = {"n_uavs": 100, "nlos": 0.0, "uwb_tail": 0.5, "horizon": 2}
+    results = evaluate(make_scenario("swarm-v0", **SMALL | overrides), ["map", "dwmds_st"], 4)
+    assert results.bound is not None
+    bound = results.bound.mse.numpy()[:, 0][results.scored[:, 0]].mean() ** 0.5
+    for agent in ("map", "dwmds_st"):
+        first = rmse(results.agents[agent].error[:, :1], results.scored[:, :1])
+        assert bound < first < 1.6 * bound, agent
+
+
 def test_calibrated_covariances_are_honest(results: Any) -> None:
     for agent in ("dwmds_st", "map"):
         nees = results.agents[agent].nees[:, 10:][results.scored[:, 10:]]
