@@ -84,7 +84,8 @@ def test_every_world_can_be_built_and_has_a_key_of_its_own() -> None:
     for variant in planned:
         assert variant.build().horizon == 9
         assert 1 <= plan.runs_in(variant, 10) <= 10
-    assert plan.runs_in(Variant("x", "x", (("n_uavs", 20),)), 100) == 20
+    for uavs, runs in ((3, 50), (10, 20), (20, 5)):
+        assert plan.runs_in(Variant("x", "x", (("n_uavs", uavs),)), 100) == runs
 
 
 def test_claims_about_recordings_follow_the_runs() -> None:
