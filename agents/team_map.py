@@ -90,8 +90,9 @@ class RecursiveMap(_Joint):
     ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does not
     estimate what clocks and antennas add to ranges.
 
-    In the first step ranges are weighed anew by what is unsure of where UAVs are by then: a prior
-    of many noises' width cannot tell good ranges from bad."""
+    In a swarm's first step ranges are weighed anew by what is unsure of where UAVs are by then: a
+    prior of many noises' width cannot tell good ranges from bad. Few links could agree on a wrong
+    place: where they are not dense, the first weights stay."""
 
     name = "map"
 
@@ -112,7 +113,7 @@ class RecursiveMap(_Joint):
         known = joint.held_by(whole, still)
         found = self.solved(now, known, now.place)
         begins = (belief.step == 0).any(-1)[:, None, None]
-        for _ in range(_AGAIN if bool(begins.any()) else 0):
+        for _ in range(_AGAIN if self.dense and bool(begins.any()) else 0):
             between = torch.where(begins, unsure(now, found), now.between)
             now = replace(now, between=between)
             found = self.solved(now, known, torch.where(begins, found.position, now.place))
