@@ -83,7 +83,7 @@ def hard(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
 
 def runs_in(variant: Variant, runs: int) -> int:
     """Half of the runs in worlds beyond the paper's; a fifth in teams of more than five, a
-    twentieth in those of more than ten, where a step costs a thousand times as much."""
+    twentieth in those of more than ten, where a step costs twenty times as much."""
     overrides = dict(variant.overrides)
     uavs = overrides.get("n_uavs", 3)
     if uavs > 5:
