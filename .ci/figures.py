@@ -1,5 +1,5 @@
-"""Figures of `coloc evaluate` for every agent in every scenario, on few steps: a fingerprint of what
-the product computes, taken before and after a change that must not move a number.
+"""Figures of `coloc evaluate` for every agent in every scenario, on few steps: a fingerprint of
+what the product computes, taken before and after a change that must not move a number.
 
     python .ci/figures.py take before.json          # in the checkout before (about ten minutes)
     python .ci/figures.py take after.json           # in the checkout after
@@ -33,7 +33,14 @@ SHORT = {  # scenario: overrides that make it short
     "swarm-v0": ["horizon=8", "n_uavs=60"],
     "wsn-v0": ["horizon=25"],
 }
-HARD = ["horizon=25", "landmarks=5", "nlos=0.3", "anchors=4", "false_matches=0.1", "message_loss=0.2"]
+HARD = [
+    "horizon=25",
+    "landmarks=5",
+    "nlos=0.3",
+    "anchors=4",
+    "false_matches=0.1",
+    "message_loss=0.2",
+]
 OPTIONS = [  # of agents, in the hard world indoors
     "ekf:robust=huber+gate+ransac+temporal+cross",
     "ekf:fusion=ci",
@@ -63,11 +70,15 @@ UNTOUCHED = ("ms_per_step",)
 
 def cases(agents: list[str]) -> list[tuple[str, list[str], str]]:
     """(scenario, overrides, agent) of everything that is compared."""
-    found = [(scenario, settings, agent) for scenario, settings in SHORT.items() for agent in agents]
+    found = [
+        (scenario, settings, agent) for scenario, settings in SHORT.items() for agent in agents
+    ]
     found += [("indoor-v0", HARD, agent) for agent in [*agents, *OPTIONS]]
     found += [("swarm-v0", SHORT["swarm-v0"], agent) for agent in SWARM_OPTIONS]
-    return found + [("indoor-v0", [*SHORT["indoor-v0"], "motion=random", "imu_bias=true"], agent)
-                    for agent in ("ekf", "pf800", "mappo", "ippo", "sb3-ppo")]
+    return found + [
+        ("indoor-v0", [*SHORT["indoor-v0"], "motion=random", "imu_bias=true"], agent)
+        for agent in ("ekf", "pf800", "mappo", "ippo", "sb3-ppo")
+    ]
 
 
 def agents() -> list[str]:
@@ -88,12 +99,24 @@ def one(case: tuple[str, list[str], str]) -> tuple[str, Any]:
     key = " ".join((scenario, *settings, agent))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
-        words = ["evaluate", scenario, "--agents", agent, "--runs", "2", "--seed", "5", "--no-figures"]
+        words = [
+            "evaluate",
+            scenario,
+            "--agents",
+            agent,
+            "--runs",
+            "2",
+            "--seed",
+            "5",
+            "--no-figures",
+        ]
         words += [] if agent == "dead_reckoning" else ["--no-bound"]
         words += [x for setting in settings for x in ("--set", setting)]
         result = CliRunner().invoke(app, [*words, "--out", str(out)])
         if not (out / "results.json").exists():
-            return key, result.output.strip()[-300:] + (repr(result.exception) if result.exception else "")
+            return key, result.output.strip()[-300:] + (
+                repr(result.exception) if result.exception else ""
+            )
         found = json.loads((out / "results.json").read_text())
     figures = found["agents"][agent]
     for name in UNTOUCHED:
@@ -131,8 +154,10 @@ def compare(before: Path, after: Path) -> int:
                 if figures[name] != other.get(name):
                     print(f"    {name}: {figures[name]} -> {other.get(name)}")
         else:
-            print(f"    {figures if isinstance(figures, str) else 'figures'} -> "
-                  f"{other if isinstance(other, (str, type(None))) else 'figures'}")
+            print(
+                f"    {figures if isinstance(figures, str) else 'figures'} -> "
+                f"{other if isinstance(other, (str, type(None))) else 'figures'}"
+            )
     print(f"{len(old)} cases compared, {wrong} differ")
     return wrong
 

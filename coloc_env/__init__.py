@@ -13,10 +13,10 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import FAMILIES, make_scenario
 
 if TYPE_CHECKING:
-    from coloc_env.batched import CoLocEnv
-    from coloc_env.parallel import env, parallel_env
-    from coloc_env.per_uav import PerUavEnv
-    from coloc_env.vec_env import CoLocVecEnv
+    from coloc_env.envs.per_uav import PerUavEnv
+    from coloc_env.envs.pettingzoo import env, parallel_env
+    from coloc_env.envs.sb3 import CoLocVecEnv
+    from coloc_env.envs.torchrl import CoLocEnv
     from coloc_env.world import World
 
 __all__ = [
@@ -31,12 +31,12 @@ __all__ = [
 ]
 
 _HOMES = {  # loaded when asked for: TorchRL takes a second that PettingZoo's users need not wait
-    "CoLocEnv": "coloc_env.batched",
-    "CoLocVecEnv": "coloc_env.vec_env",
-    "PerUavEnv": "coloc_env.per_uav",
+    "CoLocEnv": "coloc_env.envs.torchrl",
+    "CoLocVecEnv": "coloc_env.envs.sb3",
+    "PerUavEnv": "coloc_env.envs.per_uav",
     "World": "coloc_env.world",
-    "env": "coloc_env.parallel",
-    "parallel_env": "coloc_env.parallel",
+    "env": "coloc_env.envs.pettingzoo",
+    "parallel_env": "coloc_env.envs.pettingzoo",
 }
 
 
@@ -52,7 +52,7 @@ def _register() -> None:
             pettingzoo.register(
                 face,
                 f"coloc/{scenario}",
-                entry_point=f"coloc_env.parallel:{maker}",
+                entry_point=f"coloc_env.envs.pettingzoo:{maker}",
                 kwargs={"scenario": scenario},
             )
 

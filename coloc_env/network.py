@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box
 from coloc_env.sensors.base import in_slots, require, squared_norm
-from coloc_env.walls import depth
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
 _SHADOWING = 4.0  # dB, standard deviation: IEEE 802.15.4a channel model, office without sight, 3.9

@@ -17,7 +17,7 @@ from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation, action_width, static_leaves
 from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
-from coloc_env.sense import Frame, Past, Sensed, draw_prior, sense
+from coloc_env.sensing import Frame, Past, Sensed, draw_prior, sense
 
 _AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: more would not be faster
 _LONGEST = 512  # steps sensed ahead at most: a reset throws away what was not used

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
-from agents.particles.belief import normal, uniform
+from agents.particle.belief import normal, uniform
 from agents.stein.likelihood import Scale
 from agents.tensorclasses import build
 from coloc_env.geometry import poses_in, rotate, rotation_matrix

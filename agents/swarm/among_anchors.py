@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.ekf import elapsed
+from agents.kalman.ekf import elapsed
 from agents.localizer import Estimate, Factory, Localizer
 from agents.models.process import make_process
 from agents.swarm import joint

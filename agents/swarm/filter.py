@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from agents.ekf import elapsed
+from agents.kalman.ekf import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
 from agents.swarm import (

@@ -5,8 +5,8 @@ import math
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from agents.checkpoint import Learned
 from agents.layers import Linear, SiLU, sigmoid, softplus
+from agents.weights import Learned
 
 HIDDEN = 32
 SHARED = (

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from coloc_env.bounds.mixture import EXACT, range_information
 from coloc_env.geometry import cross_matrix, rotation_matrix
+from coloc_env.geometry.walls import depth
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
 from coloc_env.sensors import (
@@ -31,7 +32,6 @@ from coloc_env.sensors import (
     UavBearings,
 )
 from coloc_env.sensors.ranging import Tags, tag_positions
-from coloc_env.walls import depth
 
 SHARED = (Ranging, UavBearings)  # sensors between UAVs
 

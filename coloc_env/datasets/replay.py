@@ -29,7 +29,7 @@ from coloc_env.sensors import (
     UavBearings,
 )
 from coloc_env.sensors import Recorded as RecordedSensor
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 
 def recorded_motion(recording: Recording, grid: Grid) -> Recorded:

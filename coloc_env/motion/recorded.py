@@ -7,7 +7,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from coloc_env.scenario import ConstantVelocity, Prior, Scenario
 from coloc_env.scenarios.registry import register
 from coloc_env.scenarios.replay import cut, loaded
 from coloc_env.sensors import Odometry, Ranging, RecordedPoses, Reference, RelativePose
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 _DT = 1.0  # s: the recording has one row a second
 _HEIGHT_STD, _TILT_STD = 0.1, 0.05  # m, rad: of what is believed of the agents' heights and tilts

@@ -12,7 +12,7 @@ from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Prior, Process, Scenario, Wheeled
 from coloc_env.scenarios.registry import register
 from coloc_env.sensors import Odometry, Reference, RelativePose
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 _SPACING = 2.0  # m, of the lattice on which a static team stands (eq. 27)
 _LATTICE = (0, 1, 2)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Arena, Kinematics
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 MASK = (0.0, 1.0)
 

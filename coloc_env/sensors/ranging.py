@@ -9,6 +9,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotate
+from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box, Kinematics
 from coloc_env.sensors.base import (
     MASK,
@@ -20,9 +21,8 @@ from coloc_env.sensors.base import (
     require,
     squared_norm,
 )
-from coloc_env.sensors.clock import Clock
-from coloc_env.sensors.range_noise import RangeNoise
-from coloc_env.walls import depth
+from coloc_env.sensors.errors.clock import Clock
+from coloc_env.sensors.errors.range_noise import RangeNoise
 
 Tags = tuple[tuple[tuple[float, ...], ...], ...]
 

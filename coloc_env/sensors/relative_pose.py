@@ -11,7 +11,7 @@ from coloc_env import noise
 from coloc_env.geometry import poses_in, rotate_by
 from coloc_env.motion import Arena
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from agents import LOCALIZERS, options_of
-from agents.cspf import SteinFilter
+from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 
 STRANGER = 1  # the UAV that is cut off, garbled or failing

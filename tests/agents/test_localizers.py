@@ -8,10 +8,10 @@ import torch
 from tensordict import is_tensorclass
 
 from agents import LOCALIZERS, make, options_of
-from agents.emvf import MinimumVarianceFir
-from agents.learned_policy import PolicyAgent
+from agents.kalman.emvf import MinimumVarianceFir
+from agents.policies.learned import PolicyAgent
 from agents.stein.team import RelativeTeam
-from agents.team_map import Snapshot
+from agents.swarm.map import Snapshot
 from coloc_env.observation import Observation, action_width
 
 EXACT = 0.0

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents import LOCALIZERS, Localizer, make, options_of, register
-from agents.ekf import CooperativeEkf
+from agents.kalman.ekf import CooperativeEkf
 from agents.robust import RobustScreen
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.scenarios import make_scenario

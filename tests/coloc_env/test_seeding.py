@@ -9,8 +9,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from coloc_env.batched import CoLocEnv
-from coloc_env.parallel import CoLocParallelEnv, parallel_env
+from coloc_env.envs.pettingzoo import CoLocParallelEnv, parallel_env
+from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.actions import Estimates, check
+from coloc_env.envs.actions import Estimates, check
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled

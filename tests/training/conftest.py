@@ -15,7 +15,7 @@ from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, ConstantVelocity, Prior, Scenario
-from training.results import AgentResult, Results
+from training.evaluation.results import AgentResult, Results
 
 
 class Belief(TensorClass["nocast"]):

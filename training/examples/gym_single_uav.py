@@ -19,7 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from agents.team import SingleUavEnv
+from agents.policies.team import SingleUavEnv
 
 Policy = Callable[[np.ndarray], np.ndarray]
 

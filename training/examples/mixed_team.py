@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from agents.team import Team
+from agents.policies.team import Team
 from coloc_env import Scenario, make_scenario, parallel_env
 
 METHODS = ("ekf", "ekf:robust=huber", "pf500", "pfnn", "ekf_trust")

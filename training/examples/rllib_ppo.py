@@ -27,7 +27,7 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.tune.registry import register_env
 
 from coloc_env import parallel_env
-from coloc_env.wrappers import Flatten
+from coloc_env.envs.wrappers import Flatten
 
 
 def world(settings: dict[str, Any]) -> Flatten:

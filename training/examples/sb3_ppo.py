@@ -18,7 +18,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from agents.correction import with_base
+from agents.wrappers.correction import with_base
 from coloc_env import CoLocVecEnv
 
 SCENE: dict[str, Any] = {"uwb_std": 0.2, "believed_uwb_std": 0.05, "nlos": 0.3, "motion": "random"}

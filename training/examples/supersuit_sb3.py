@@ -1,11 +1,11 @@
 """SuperSuit's route from PettingZoo to stable-baselines3; ``sb3_ppo`` is the better one.
 
-Copies of one world, one after the other; flat observations by ``coloc_env.wrappers.Flatten``. What
-it loses: ``TimeLimit.truncated`` is never set, so SB3 takes the horizon for a failure and does not
-bootstrap there (harmless only with gamma = 0). The last step's infos (``episode_rmse``) are
-overwritten by the next episode's. ``seed`` and ``get_attr`` raise AttributeError, so no ``PPO(
-seed=...)``. ``reset(seed)`` gives copy i the worlds seed + i, seed + i + 1, ..., which its
-neighbours fly, too (hence the loop below). It steps at a tenth of ``CoLocVecEnv``'s speed.
+Copies of one world, one after the other; flat observations by ``coloc_env.envs.wrappers.Flatten``.
+What it loses: ``TimeLimit.truncated`` is never set, so SB3 takes the horizon for a failure and does
+not bootstrap there (harmless only with gamma = 0). The last step's infos (``episode_rmse``) are
+overwritten by the next episode's. ``seed`` and ``get_attr`` raise AttributeError, so no
+``PPO(seed=...)``. ``reset(seed)`` gives copy i the worlds seed + i, seed + i + 1, ..., which its
+neighbours have, too (hence the loop below). It steps at a tenth of ``CoLocVecEnv``'s speed.
 
     pip install -e . supersuit
     python -m training.examples.supersuit_sb3
@@ -21,7 +21,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from coloc_env import parallel_env
-from coloc_env.wrappers import Flatten
+from coloc_env.envs.wrappers import Flatten
 
 try:
     import supersuit

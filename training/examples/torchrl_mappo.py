@@ -21,8 +21,8 @@ from torchrl.envs import CatTensors, EnvBase, ExplorationType, TransformedEnv, s
 from torchrl.modules import MultiAgentMLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives.multiagent import MAPPOLoss
 
-from agents.actor import Normalizer
-from agents.correction import with_base
+from agents.policies.actor import Normalizer
+from agents.wrappers.correction import with_base
 from coloc_env import CoLocEnv
 
 SCENE: dict[str, Any] = {"uwb_std": 0.2, "believed_uwb_std": 0.05, "nlos": 0.3, "motion": "random"}

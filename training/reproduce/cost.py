@@ -20,9 +20,9 @@ from torch.profiler import ProfilerActivity, profile
 from agents.localizer import Localizer, make
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
-from training.evaluate import Progress
-from training.metrics import Floats
-from training.play import NUMERICAL
+from training.evaluation.evaluate import Progress
+from training.evaluation.metrics import Floats
+from training.evaluation.rollout import NUMERICAL
 from training.reproduce.store import Store
 from training.reproduce.study import Piece, Variant
 

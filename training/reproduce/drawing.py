@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from training.figures import STYLE
+from training.evaluation.figures import STYLE
 
 
 def save(drawing: Callable[[], Figure], file: Path) -> None:

@@ -19,7 +19,12 @@ from torch import nn
 from agents.localizer import Localizer
 
 _PACKAGES = ("agents", "coloc_env", "training")
-_WORLD = ("coloc_env.world", "coloc_env.scenarios", "coloc_env.bounds", "training.play")
+_WORLD = (
+    "coloc_env.world",
+    "coloc_env.scenarios",
+    "coloc_env.bounds",
+    "training.evaluation.rollout",
+)
 
 
 def code_of(localizer: Localizer, *modules: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from training.evaluate import Progress
+from training.evaluation.evaluate import Progress
 from training.reproduce.store import Store
 from training.reproduce.study import Piece, Study, compute
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from training.metrics import Difference
+from training.evaluation.metrics import Difference
+from training.evaluation.results import plain, table
 from training.reproduce import verdicts
 from training.reproduce.study import Study
 from training.reproduce.verdicts import Verdict
-from training.results import plain, table
 
 DASH = "–"
 Text = list[str]

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from training.metrics import Flags, Floats
-from training.results import AgentResult, Results
+from training.evaluation.metrics import Flags, Floats
+from training.evaluation.results import AgentResult, Results
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from training.staging import staged_file
+from coloc_env.staging import staged_file
 
 Arrays = dict[str, np.ndarray]
 _FACTS = "facts.json"

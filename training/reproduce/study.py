@@ -20,10 +20,10 @@ from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bou
 from coloc_env.options import require_known
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
-from training.evaluate import Progress, evaluate
+from training.evaluation.evaluate import Progress, evaluate
+from training.evaluation.results import AgentResult, Results
 from training.reproduce.identity import code_of, weights_of
 from training.reproduce.store import Arrays, Store
-from training.results import AgentResult, Results
 
 WORLD = "dead_reckoning"  # flown with the bound, for the worlds' truth: it applies to all of them
 BOUNDS: dict[str, Callable[[Scenario, int, int], Bound]] = {

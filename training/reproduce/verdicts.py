@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from scipy.stats import binomtest
 
-from training import metrics
-from training.metrics import Difference, Flags, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Flags, Floats
 
 REPRODUCED, NOT, CONTRADICTED, UNKNOWN = (
     "reproduced",

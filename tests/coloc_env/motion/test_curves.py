@@ -16,7 +16,7 @@ from coloc_env.motion import (
     Square,
     StopAndGo,
 )
-from coloc_env.tape import Tape
+from coloc_env.series import Tape
 
 ROOM = (30.0, 20.0, 5.0)
 

@@ -18,7 +18,7 @@ from coloc_env.scenario import Inertial, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import GRAVITY, AnchorRanging, Imu, Odometry, RangeNoise, Sensor
 from coloc_env.world import World
-from training.evaluate import evaluate
+from training.evaluation.evaluate import evaluate
 
 ROOM = (30.0, 20.0, 5.0)
 DT = 0.1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.metrics import Difference
+from training.evaluation.metrics import Difference
 from training.reproduce.cspf import plan
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.verdicts import Claim, Verdict, decide, interval, share

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from training.metrics import Floats
+from training.evaluation.metrics import Floats
 from training.reproduce.cspf import plan
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.drawing import panels

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from training.metrics import Flags, Floats
+from training.evaluation.metrics import Flags, Floats
 from training.reproduce.runs import AgentRuns
 
 

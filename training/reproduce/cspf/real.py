@@ -5,11 +5,11 @@ from itertools import product
 
 import numpy as np
 
-from training.metrics import Floats, rmse_per_run
+from training.evaluation.metrics import Floats, rmse_per_run
+from training.evaluation.results import short
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.study import WORLD, Variant
 from training.reproduce.verdicts import Claim, Verdict, decide, gain, interval
-from training.results import short
 
 _FAST = "cspf:anneal=0.85"  # a step lasts a second and tells every pair: it need not wait as long
 TEAM = (

@@ -6,13 +6,13 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from training.evaluation.results import table
 from training.reproduce import drawing, reporting, verdicts
 from training.reproduce.cspf import figures, plan, real, tables
 from training.reproduce.cspf.claims import verdicts as judge
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.reporting import Text
 from training.reproduce.study import WORLD, Study, Variant
-from training.results import table
 
 FILES = ("convergence.png", "outliers.png", "paper.json")
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from training.evaluate import Progress
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress
 from training.reproduce.cspf import plan, real, report
 from training.reproduce.pool import Note, obtain
 from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
 from training.reproduce.study import Planned, Study
-from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
 _STORE = "store"

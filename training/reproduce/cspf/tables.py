@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from training.evaluation.results import short
 from training.reproduce.cspf import plan
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.verdicts import share
-from training.results import short
 
 Table = tuple[list[str], list[list[str]]]
 

@@ -9,8 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from coloc_env.render.style import INK, MUTED
-from training.figures import STYLE
-from training.metrics import Floats
+from training.evaluation.figures import STYLE
+from training.evaluation.metrics import Floats
 from training.reproduce.marl.plan import Trained
 from training.reproduce.study import WORLD
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Difference, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Floats
+from training.evaluation.results import Results, short, table
 from training.reproduce.marl import figures
 from training.reproduce.marl.plan import FILTERS, Goal, Trained, goals, variants
 from training.reproduce.study import WORLD, Study
 from training.reproduce.verdicts import gain
-from training.results import Results, short, table
 
 FILES = ("curves.png", "goals.csv", "results.json", "report.md")
 SETTLED = 10.0  # s after which a run has begun

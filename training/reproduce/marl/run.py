@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from coloc_env.options import require_known
-from training import runs as training_runs
-from training.evaluate import Progress
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress
+from training.learning import run as training_runs
 from training.reproduce.marl import report
 from training.reproduce.marl.plan import FILTERS, SEEDS, Trained, trainings, variants
 from training.reproduce.pool import Note, obtain
 from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study
-from training.staging import staged_folder
 
 _STORE, _RUNS = "store", "runs"
 Job = tuple[Trained, int, Path]
@@ -79,7 +79,7 @@ def train(todo: Sequence[Job], jobs: int, tell: Progress, note: Note) -> None:
 def _train(job: Job) -> str:
     import torch
 
-    from training import mappo as _mappo  # noqa: F401  (registers its trainings)
+    from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
 
     torch.set_num_threads(1)
     one, seed, folder = job

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.metrics import Difference, Floats
+from training.evaluation.metrics import Difference, Floats
 from training.reproduce.nnhpff.measures import Runs
 from training.reproduce.verdicts import (
     Claim,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
-from training.metrics import Flags, Floats
+from training.evaluation.metrics import Flags, Floats
 
 BINS = 10
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coloc_env.render.style import MUTED
-from training.metrics import Floats
+from training.evaluation.metrics import Floats
 from training.reproduce.drawing import panels
 from training.reproduce.nnhpff.claims import FAILED
 from training.reproduce.nnhpff.detection import calibration, curve

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from training.metrics import Flags, Floats
-from training.nnhpff import FAILED
+from training.evaluation.metrics import Flags, Floats
+from training.learning.nnhpff import FAILED
 from training.reproduce.cost import Cost
 from training.reproduce.nnhpff.measures import Runs
 from training.reproduce.study import WORLD, Study, Variant

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Flags, Floats
-from training.nnhpff import FAILED
+from training.evaluation import metrics
+from training.evaluation.metrics import Flags, Floats
+from training.learning.nnhpff import FAILED
 from training.reproduce.runs import AgentRuns
 
 FIRST_CORNER = 100  # step

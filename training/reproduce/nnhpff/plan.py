@@ -3,7 +3,7 @@
 from itertools import product
 
 from coloc_env.scenarios import parse_override
-from training.nnhpff import MAINS, VARIANTS
+from training.learning.nnhpff import MAINS, VARIANTS
 from training.reproduce.study import Variant
 
 TITLE = "Neural-network-aided hybrid particle/FIR filter, *Electronics* 2025, 14(21), 4346"

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import training.nnhpff as _nnhpff  # noqa: F401  (registers its training)
-from training import runs as training_runs
-from training.evaluate import Progress
+import training.learning.nnhpff as _nnhpff  # noqa: F401  (registers its training)
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress
+from training.learning import run as training_runs
 from training.reproduce.cost import measured
 from training.reproduce.nnhpff import plan, report
 from training.reproduce.nnhpff.flown import Flown, learning_curve
@@ -13,7 +14,6 @@ from training.reproduce.pool import Note, obtain
 from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
 from training.reproduce.study import Planned, Study
-from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
 _STORE, _RUN = "store", "run"

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from training.evaluation.results import short
 from training.reproduce.nnhpff.detection import calibration, confusion, curve
 from training.reproduce.nnhpff.flown import Detections, Flown
 from training.reproduce.nnhpff.measures import WITHIN, Runs
 from training.reproduce.reporting import Table, ends
 from training.reproduce.verdicts import interval
-from training.results import short
 
 PAPER_MS = {"pf": 4.15, "hpff": 4.55, "nnhpff": 7.01}
 

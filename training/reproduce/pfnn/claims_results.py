@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Difference, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Floats
 from training.reproduce.pfnn import paper
 from training.reproduce.pfnn.flown import Case, Flown
 from training.reproduce.pfnn.plan import ablation_agents

@@ -14,9 +14,9 @@ from scipy.ndimage import uniform_filter1d
 
 from coloc_env.render.style import INK, MUTED, rgb, uav_colours
 from coloc_env.world import World
-from training import metrics
-from training.figures import BOUND, log_axis
-from training.metrics import Floats
+from training.evaluation import metrics
+from training.evaluation.figures import BOUND, log_axis
+from training.evaluation.metrics import Floats
 from training.reproduce import drawing
 from training.reproduce.pfnn import paper
 from training.reproduce.pfnn.flown import Flown

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Difference, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Floats
+from training.evaluation.results import Results
 from training.reproduce.cost import Cost
 from training.reproduce.pfnn.in_flight import InFlight
 from training.reproduce.verdicts import Claim
-from training.results import Results
 
 STEADY = 10.0  # s: from here on a filter has settled
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 from agents.localizer import make
-from training.evaluate import Progress
-from training.metrics import Floats
-from training.pfnn_online import learn_in_flight
+from training.evaluation.evaluate import Progress
+from training.evaluation.metrics import Floats
+from training.learning.pfnn_online import learn_in_flight
 from training.reproduce.identity import code_of
 from training.reproduce.store import Store
 from training.reproduce.study import Piece, Variant
@@ -28,7 +28,7 @@ def learned(store: Store, variant: Variant, seed: int, runs: int, tell: Progress
     name = replace(piece, agent="pfnn-in-flight").name
     settings = piece.settings() | {
         "weights": "learned in flight",
-        "code": code_of(make("pfnn", variant.build()), "training.pfnn_online"),
+        "code": code_of(make("pfnn", variant.build()), "training.learning.pfnn_online"),
     }
     if not store.has(name, settings):
         flown = learn_in_flight(variant.build(), runs, seed, tell)

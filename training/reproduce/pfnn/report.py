@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from training.evaluation.results import table
 from training.reproduce import cost, reporting, verdicts
 from training.reproduce.pfnn import figures, goals, paper, robust_figures, robustness, tables
 from training.reproduce.pfnn.claims import verdicts as judge
@@ -12,7 +13,6 @@ from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.robustness import Cells
 from training.reproduce.reporting import Text
 from training.reproduce.study import Variant
-from training.results import table
 
 FILES = (
     *figures.FILES,

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from coloc_env.render.style import FLOOR, INK, MUTED, uav_colours
-from training.metrics import mean
+from training.evaluation.metrics import mean
+from training.evaluation.results import short
 from training.reproduce.drawing import save
 from training.reproduce.pfnn.robustness import Cells, compare
 from training.reproduce.study import Variant
-from training.results import short
 
 FILES = ("robustness.png", "robustness_paired.png")
 REFERENCE = "ekf:robust=huber"

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Difference, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Floats
+from training.evaluation.results import Results, short, table
 from training.reproduce.pfnn.plan import runs_in
 from training.reproduce.study import Study, Variant
-from training.results import Results, short, table
 
 REFERENCES = ("apf", "ekf:robust=huber")  # paired differences are taken to these
 MATRICES = {

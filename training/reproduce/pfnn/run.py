@@ -5,7 +5,8 @@ from pathlib import Path
 
 from agents.localizer import make
 from coloc_env.options import require_known
-from training.evaluate import Progress
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress
 from training.reproduce.cost import measured
 from training.reproduce.pfnn import paper, report
 from training.reproduce.pfnn.flown import Flown
@@ -24,7 +25,6 @@ from training.reproduce.pool import Note, obtain
 from training.reproduce.reporting import Text, write_report
 from training.reproduce.store import Store
 from training.reproduce.study import WORLD, Piece, Study, Variant
-from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
 _STORE = "store"

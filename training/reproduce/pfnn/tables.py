@@ -4,14 +4,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from training import metrics
-from training.metrics import Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Floats
+from training.evaluation.results import short
 from training.reproduce.pfnn import paper
 from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.in_flight import NAME as LEARNING
 from training.reproduce.pfnn.plan import ablation_agents
 from training.reproduce.reporting import DASH, difference
-from training.results import short
 
 Table = tuple[list[str], list[list[str]]]  # header and lines
 

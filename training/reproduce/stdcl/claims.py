@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coloc_env.bounds import Bound
-from training.metrics import Difference, Floats
+from training.evaluation.metrics import Difference, Floats
 from training.reproduce.cost import Cost
 from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.flown import Flown

@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 from coloc_env.bounds import Bound
 from coloc_env.render.style import MUTED
-from training import metrics
-from training.figures import log_axis
-from training.metrics import Floats
+from training.evaluation import metrics
+from training.evaluation.figures import log_axis
+from training.evaluation.metrics import Floats
+from training.evaluation.results import short
 from training.reproduce.cost import Cost
 from training.reproduce.drawing import panels
 from training.reproduce.stdcl import plan
@@ -21,7 +22,6 @@ from training.reproduce.stdcl.measures import Runs, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT
 from training.reproduce.stdcl.tables import exponent, medians, spread
 from training.reproduce.verdicts import interval
-from training.results import short
 
 Bounds = Mapping[str, Bound | None]
 _BOTH = ("mds", plan.WHOLE)  # whom figures 4 and 5 compare

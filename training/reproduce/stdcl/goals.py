@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.metrics import Difference
+from training.evaluation.metrics import Difference
 from training.reproduce.cost import Cost
 from training.reproduce.reporting import Table, ends
 from training.reproduce.stdcl import plan

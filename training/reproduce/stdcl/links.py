@@ -15,10 +15,10 @@ from torch import Tensor
 
 from agents.localizer import Localizer, make
 from agents.swarm.filter import SwarmFilter
-from coloc_env.walls import depth
+from coloc_env.geometry.walls import depth
 from coloc_env.world import World
-from training.evaluate import Progress
-from training.metrics import Flags, Floats
+from training.evaluation.evaluate import Progress
+from training.evaluation.metrics import Flags, Floats
 from training.reproduce.identity import code_of
 from training.reproduce.store import Arrays, Store
 from training.reproduce.study import Piece, Variant

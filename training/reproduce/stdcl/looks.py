@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from training.figures import BOUND, log_axis
+from training.evaluation.figures import BOUND, log_axis
 from training.reproduce.stdcl import plan
 from training.reproduce.study import WORLD
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coloc_env.render.style import MUTED
-from training import metrics
+from training.evaluation import metrics
 from training.reproduce.drawing import panels
 from training.reproduce.stdcl import plan
 from training.reproduce.stdcl.figures import seconds

@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from coloc_env.bounds import Bound, SnapshotBound
-from training import metrics
-from training.metrics import Difference, Floats
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference, Floats
 from training.reproduce.runs import AgentRuns
 from training.reproduce.verdicts import gain
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from coloc_env.options import require_known
-from training.evaluate import Progress
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress
 from training.reproduce.cost import Cost, measured
 from training.reproduce.pool import Note, obtain
 from training.reproduce.reporting import Text, write_report
@@ -14,7 +15,6 @@ from training.reproduce.stdcl.flown import Flown
 from training.reproduce.stdcl.plan import METHODS, OPTIMIZER, REFERENCES, WHOLE, Plan
 from training.reproduce.store import Store
 from training.reproduce.study import Study, Variant
-from training.staging import staged_folder
 
 NAMES = (*report.FILES, "report.md")
 _STORE = "store"

@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coloc_env.bounds import SnapshotBound
-from training import metrics
-from training.metrics import Difference
+from training.evaluation import metrics
+from training.evaluation.metrics import Difference
+from training.evaluation.results import short
 from training.reproduce.cost import Cost
 from training.reproduce.reporting import DASH, Table, difference, ends
 from training.reproduce.stdcl import plan
@@ -16,7 +17,6 @@ from training.reproduce.stdcl.measures import Runs, better, told_by
 from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT, Scene
 from training.reproduce.study import WORLD
 from training.reproduce.verdicts import interval
-from training.results import short
 
 PAPER_NRMSE = {plan.FAST: 0.0077, plan.MODERATE: 0.0068}
 PAPER_MS = {"dwmds": 28.0, "stdcl": 36.0}  # N = 200, MATLAB, i7-12700K

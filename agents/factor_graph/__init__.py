@@ -1,0 +1,1 @@
+"""Factor graphs, solved by GTSAM."""

@@ -1,0 +1,1 @@
+"""Kalman filters: one per UAV, or one over the whole team."""

@@ -1,0 +1,197 @@
+"""One EKF over the whole team, with exact cross-covariances: the reference for cooperation.
+
+It sees every UAV's measurements at once, whatever the network lets through, so it is no method for
+a real swarm but what decentralized ones are measured against.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from agents.kalman.ekf import (
+    GaussianBelief,
+    elapsed,
+    gaussian_estimate,
+)
+from agents.localizer import Estimate, Localizer, register
+from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.models.process import make_process
+from agents.models.update import posterior
+from agents.robust import Prediction, RobustScreen, Trust
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+
+
+@register("ekf_joint")
+class JointEkf(Localizer[GaussianBelief]):
+    """Centralized EKF of the team's joint state; options as ``ekf`` has them.
+
+    Its belief's covariance is [B, N, E, N · E]: each UAV's rows of the joint matrix.
+    """
+
+    name = "ekf_joint"
+    centralized = True
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        robust: str = "none",
+        gate: float = 0.999,
+        iterations: int = 2,
+        cooperate: bool = True,
+    ) -> None:
+        super().__init__(believed)
+        if believed.slots < believed.arena.n_uavs:
+            raise ValueError(
+                f"ekf_joint: a team of {believed.arena.n_uavs} with {believed.slots} neighbour "
+                "slots is too large for it; raise max_neighbours to the team's size"
+            )
+        if iterations < 1:
+            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
+        self.process, self.iterations = make_process(believed), iterations
+        self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
+        self.screen = RobustScreen(self.process, self.models, robust, gate)
+
+    @property
+    def exchanges(self) -> bool:
+        return True
+
+    def reset(self, observation: Observation) -> GaussianBelief:
+        x, own = self.process.initial(observation["prior"].double())
+        b, n = x.shape[:2]
+        step = torch.zeros(b, n, dtype=torch.int64, device=x.device)
+        return GaussianBelief(
+            state=x,
+            covariance=_diagonal(own).flatten(-2),
+            step=step,
+            memory=self.screen.memory(observation),
+            batch_size=[b, n],
+        )
+
+    def step(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[GaussianBelief, Estimate]:
+        b, n, e = *belief.state.shape[:2], self.process.error_size
+        dt = elapsed(self.process, belief.step).double()
+        u = self.process.inputs(observation)
+        f, q = self.process.linearize(belief.state, u, dt)
+        x = self.process.propagate(belief.state, u, dt)
+        p = belief.covariance.unflatten(-1, (n, e)).transpose(2, 3)  # [B, N, N, E, E]
+        p = f.unsqueeze(2) @ p @ f.mT.unsqueeze(1) + _diagonal(q).transpose(2, 3)
+        p = p.transpose(2, 3).reshape(b, n * e, n * e)
+        x, p, memory = self._update(x, p, observation, belief.memory)
+        p = p.view(b, n, e, n * e)
+        after = GaussianBelief(
+            state=x, covariance=p, step=belief.step + 1, memory=memory, batch_size=[b, n]
+        )
+        return after, gaussian_estimate(self.process, x, self._own(p.flatten(1, 2)))
+
+    def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
+        return belief.state
+
+    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.moved(offset)
+
+    def _update(
+        self,
+        x: Float[Tensor, "B N S"],
+        p: Float[Tensor, "B M M"],
+        observation: Observation,
+        memory: Float[Tensor, "B N K"],
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B M M"], Float[Tensor, "B N K"]]:
+        """Iterated update of the joint state; neighbours are where the joint mean has them."""
+        n, e = x.shape[1], self.process.error_size
+        prior = Prediction(x, self._own(p), observation, memory)
+        state, updated, delta = x, p, torch.zeros_like(p[..., 0])
+        evidence: Any = None
+        extra = 0
+        if self.screen.extra:
+            broad = prior.broad(self.process.dim).any(-1, keepdim=True)
+            extra = self.screen.extra if bool(broad.any()) else 0
+        for iteration in range(-extra, self.iterations):
+            blocks = self._blocks(state, observation)
+            judged = blocks
+            if self.screen.judges:
+                judged = [self._doubtful(block, updated) for block in blocks]
+            if iteration == -extra:
+                evidence = self.screen.judge(judged, prior)
+            trusts = self.screen.weigh(judged, evidence, iteration == self.iterations - 1)
+            precision, vector = self._information(blocks, trusts)
+            if iteration > -extra:
+                vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
+            delta, updated = posterior(p, precision, vector)
+            state = self.process.boxplus(x, delta.unflatten(-1, (n, e)))
+            if iteration < 0:  # what is not broad has not begun
+                delta = torch.where(broad, delta, 0.0)
+                state = torch.where(broad.unsqueeze(-1), state, x)
+        memory = self.screen.remember(prior, evidence, lambda: self._blocks(state, observation))
+        return state, updated, memory
+
+    def _own(self, p: Float[Tensor, "B M M"]) -> Float[Tensor, "B N E E"]:
+        """Each UAV's own block of the joint covariance."""
+        e = self.process.error_size
+        split = p.unflatten(-1, (-1, e)).unflatten(1, (-1, e))
+        return split.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+
+    def _blocks(self, x: Float[Tensor, "B N S"], observation: Observation) -> list[Block]:
+        neighbours = self._neighbours(x)
+        return [m.linearize(self.process, x, observation, neighbours) for m in self.models]
+
+    def _doubtful(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
+        """The block as one UAV alone would judge it: with what its partners do not know of
+        themselves as noise."""
+        if block.partner is None or block.partner_variance is None:
+            return block
+        d = self.process.dim
+        variance = self._own(p)[..., :d, :d].diagonal(dim1=-2, dim2=-1)  # [B, N, d]
+        n = variance.shape[1]
+        by_slot = block.partner.unflatten(2, (-1, n, block.per_slot))
+        added = (by_slot**2 * variance[:, None, None, :, None, None]).sum(-1).flatten(2, 4)
+        return replace(block, partner_variance=block.partner_variance + added)
+
+    def _neighbours(self, x: Float[Tensor, "B N S"]) -> Neighbours:
+        b, n, d = *x.shape[:2], self.process.dim
+        position = x[:, None, :, :d].expand(b, n, n, d)
+        known = torch.ones(b, n, n, dtype=torch.bool, device=x.device)
+        return Neighbours(position=position, variance=torch.zeros_like(position), known=known)
+
+    def _information(
+        self, blocks: Sequence[Block], trusts: Sequence[Trust]
+    ) -> tuple[Float[Tensor, "B M M"], Float[Tensor, "B M"]]:
+        """Joint Λ and η. A range is one number that both ends read: each end counts half."""
+        d, e = self.process.dim, self.process.error_size
+        rows, scaled, residuals = [], [], []
+        for block, trust in zip(blocks, trusts, strict=True):
+            b, n, m, k = block.residual.shape
+            w = trust.information(block)
+            h = block.jacobian.new_zeros(b, n, m, k, n, e)
+            own = torch.arange(n, device=h.device)
+            h[:, own, :, :, own] = block.jacobian.movedim(1, 0)
+            if block.partner is not None:
+                # Measurements come as (own tag, slot, their tag) or (depth, slot): slot j is UAV j.
+                partner = block.partner.unflatten(2, (-1, n, block.per_slot))
+                spread = h.unflatten(2, (-1, n, block.per_slot))
+                for slot in range(n):
+                    spread[:, :, :, slot, :, :, slot, :d] += partner[:, :, :, slot]
+                if block.mutual:
+                    w = 0.5 * w
+            h = h.flatten(-2).flatten(1, 3)
+            rows.append(h)
+            scaled.append(h * w.flatten(1).unsqueeze(-1))
+            residuals.append(trust.residual(block).flatten(1))
+        h, wh = torch.cat(rows, 1), torch.cat(scaled, 1)
+        return h.mT @ wh, (wh.mT @ torch.cat(residuals, 1).unsqueeze(-1))[..., 0]
+
+
+def _diagonal(blocks: Float[Tensor, "B N E E"]) -> Float[Tensor, "B N E N E"]:
+    """The block-diagonal matrix of the UAVs' own blocks."""
+    b, n, e, _ = blocks.shape
+    out = blocks.new_zeros(b, n, e, n, e)
+    own = torch.arange(n, device=blocks.device)
+    out[:, own, :, own] = blocks.movedim(1, 0)
+    return out

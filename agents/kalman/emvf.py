@@ -1,0 +1,236 @@
+"""Extended minimum-variance FIR filter: an estimate from the last few steps and from nothing else.
+
+NN-HPFF paper, section 3, as a batch weighted least-squares problem over the window [m, k]. What
+happened before the window is forgotten, and so is any failure.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float32, Float64, Int64
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.kalman.ekf import DeadReckoning, GaussianBelief, elapsed, gaussian_estimate
+from agents.localizer import Estimate, Localizer, register
+from agents.models.measurements import Block, make_measurements, nobody
+from agents.models.process import Process
+from agents.robust.huber import huber_weights
+from agents.tensorclasses import build
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+from coloc_env.sensors import AnchorRanging
+from coloc_env.sensors.base import Layout
+
+_NOTHING = 1e-6  # m⁻², s²/m²: information on position and velocity before anything is measured
+_RIDGE = 1e-3  # m⁻²: what keeps a trilateration near the arena's centre where it is ambiguous
+
+
+class WindowBelief(TensorClass):
+    """What was measured in the last M steps, the newest last (zeros before the first), steps taken,
+    and dead reckoning of what a short window cannot tell (attitude, biases); batch (B, N)."""
+
+    window: Float32[Tensor, "B N M F"]
+    step: Int64[Tensor, "B N"]
+    reckoned: GaussianBelief
+
+
+@dataclass(frozen=True)
+class _Window:
+    """A window taken apart: leaves [B, N, M, F], the M − 1 inputs between its steps and their
+    lengths (s; 0 before the first step)."""
+
+    leaves: Observation
+    inputs: Float64[Tensor, "B N L U"]
+    dt: Float64[Tensor, "B N L"]
+
+
+@register("emvf")
+class MinimumVarianceFir(Localizer[WindowBelief]):
+    """FIR filter over the last ``memory`` steps, Gauss–Newton from a trilateration.
+
+    With Z = H̄ x_k + Ḡ w + v stacked over the window and Ξ = Ḡ Q̄ Ḡᵀ + R̄:
+    x̂ = (H̄ᵀ Ξ⁻¹ H̄)⁻¹ H̄ᵀ Ξ⁻¹ Z and P = (H̄ᵀ Ξ⁻¹ H̄)⁻¹, h linearized ``iterations`` times. It uses
+    what the UAV measures itself and needs no prior but, where the motion model has an attitude (and
+    biases), their dead reckoning. Where the window does not tell the state, P says so.
+    ``robust=huber`` widens the variance of what is far from the iterate it is linearized about.
+    """
+
+    name = "emvf"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        memory: int = 3,
+        iterations: int = 4,
+        robust: Literal["none", "huber"] = "none",
+    ) -> None:
+        super().__init__(believed)
+        if memory < 2 or iterations < 1:
+            raise ValueError(
+                f"memory={memory}, iterations={iterations} is not allowed: at least 2 steps and 1"
+            )
+        self.size, self.iterations, self.robust = memory, iterations, robust == "huber"
+        self.reckoning = DeadReckoning(believed)
+        self.process: Process = self.reckoning.process
+        self.models = [m for m in make_measurements(believed) if not m.cooperative]
+        layout = Layout(believed.arena, believed.slots)
+        self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
+
+    def reset(self, observation: Observation) -> WindowBelief:
+        width = self._row(observation).shape[-1]
+        prior = observation["prior"]
+        step = torch.zeros(prior.shape[:2], dtype=torch.int64, device=prior.device)
+        return WindowBelief(
+            window=prior.new_zeros(*step.shape, self.size, width),
+            step=step,
+            reckoned=self.reckoning.reset(observation),
+            batch_size=step.shape,
+        )
+
+    def watch(self, belief: WindowBelief, observation: Observation) -> WindowBelief:
+        row = self._row(observation).unsqueeze(-2)
+        reckoned = belief.reckoned
+        if self.process.attitude_size:
+            reckoned = self.reckoning.watch(reckoned, observation)
+        return build(
+            WindowBelief,
+            belief.step.shape,
+            window=torch.cat((belief.window[..., 1:, :], row), -2),
+            step=belief.step + 1,
+            reckoned=reckoned,
+        )
+
+    def step(self, belief: WindowBelief, observation: Observation) -> tuple[WindowBelief, Estimate]:
+        after = self.watch(belief, observation)
+        return after, gaussian_estimate(self.process, *self.gaussian(after, observation))
+
+    def gaussian(
+        self, belief: WindowBelief, observation: Observation
+    ) -> tuple[Float64[Tensor, "B N S"], Float64[Tensor, "B N E E"]]:
+        window, d = self._apart(belief, observation), self.process.dim
+        arena = self.believed.arena
+        reckoned = belief.reckoned
+        x = reckoned.state.clone()
+        x[..., :d], x[..., d : 2 * d] = self._trilaterated(window.leaves), 0.0
+        known = self._reckoned_information(reckoned)
+        covariance = torch.zeros_like(known)
+        low, high = (x.new_tensor(end) for end in (arena.low, arena.high))
+        for iteration in range(self.iterations):
+            if iteration:  # a step too far is taken back to where a UAV can be
+                x = torch.cat((x[..., :d].clamp(low, high), x[..., d:]), -1)
+            h, r, noise = self._stacked(x, window)
+            root = torch.linalg.cholesky_ex(noise).L
+            whitened = torch.linalg.solve_triangular(
+                root, torch.cat((h, r.unsqueeze(-1)), -1), upper=False
+            )
+            h, r = whitened[..., :-1], whitened[..., -1:]
+            ahead = self.process.boxminus(reckoned.state, x)
+            precision = h.mT @ h + known
+            covariance = torch.linalg.inv(precision)
+            covariance = 0.5 * (covariance + covariance.mT)
+            delta = covariance @ (h.mT @ r + known @ ahead.unsqueeze(-1))
+            x = self.process.boxplus(x, delta[..., 0])
+        return x, covariance
+
+    def _row(self, observation: Observation) -> Float32[Tensor, "B N F"]:
+        """What a step leaves in the window."""
+        return torch.cat([observation[name] for name in self.leaves], -1)
+
+    def _apart(self, belief: WindowBelief, observation: Observation) -> _Window:
+        widths = [observation[name].shape[-1] for name in self.leaves]
+        sensed = dict(zip(self.leaves, belief.window.split(widths, -1), strict=True))
+        still = {
+            name: leaf.unsqueeze(2)
+            for name, leaf in observation.leaves.items()
+            if name not in sensed
+        }
+        leaves = Observation(still | sensed)
+        last = torch.arange(1 - self.size, 0, device=belief.step.device)
+        taken = belief.step.unsqueeze(-1) + last  # steps taken before each of the window's last
+        dt = elapsed(self.process, taken).double()
+        inputs = self.process.inputs(leaves).expand(*belief.window.shape[:-1], -1)
+        return _Window(leaves, inputs[..., 1:, :], dt)
+
+    def _reckoned_information(self, reckoned: GaussianBelief) -> Float64[Tensor, "B N E E"]:
+        """All that is known beside the window: attitude and biases."""
+        turn, e = self.process.attitude_error, self.process.error_size
+        first = e if turn is None else turn.start
+        known = torch.zeros_like(reckoned.covariance)
+        known.diagonal(dim1=-2, dim2=-1)[..., :first] = _NOTHING
+        if first < e:
+            known[..., first:, first:] = torch.linalg.inv(reckoned.covariance[..., first:, first:])
+        return known
+
+    def _stacked(
+        self, x: Float64[Tensor, "B N S"], window: _Window
+    ) -> tuple[Float64[Tensor, "B N Z E"], Float64[Tensor, "B N Z"], Float64[Tensor, "B N Z Z"]]:
+        """H̄, the residuals of Z, and Ξ, linearized about the states that lead to ``x``."""
+        states = [x]
+        for u, dt in zip(
+            reversed(window.inputs.unbind(-2)), reversed(window.dt.unbind(-1)), strict=True
+        ):
+            states.insert(0, self.process.retreat(states[0], u, dt))
+        path = torch.stack(states, -2)
+        f, q = self.process.linearize(path[..., :-1, :], window.inputs, window.dt)
+        back, size = torch.linalg.inv(f), f.shape[-1]
+        steps = self.size - 1
+        # δ_j = Φ_j δ_k − A_j w: Φ and A from the window's end backwards, w the noise of its steps.
+        phi = torch.eye(size, dtype=x.dtype, device=x.device).expand_as(f[..., 0, :, :])
+        lag = x.new_zeros(*phi.shape[:-1], steps * size)
+        phis, lags = [phi], [lag]
+        for j in range(steps - 1, -1, -1):
+            lag = lag.clone()
+            lag[..., j * size : (j + 1) * size] += torch.eye(size, dtype=x.dtype, device=x.device)
+            phi, lag = back[..., j, :, :] @ phi, back[..., j, :, :] @ lag
+            phis.insert(0, phi)
+            lags.insert(0, lag)
+        jacobian, residual, variance = self._measured(path, window.leaves)
+        h = (jacobian @ torch.stack(phis, -3)).flatten(-3, -2)
+        g = (jacobian @ torch.stack(lags, -3)).flatten(-3, -2).unflatten(-1, (steps, size))
+        spread = (g.unsqueeze(-2) @ q.unsqueeze(-4)).flatten(-3)
+        xi = spread @ g.flatten(-2).mT + torch.diag_embed(variance.flatten(-2))
+        return h, residual.flatten(-2), xi
+
+    def _measured(
+        self, path: Float64[Tensor, "B N M S"], leaves: Observation
+    ) -> tuple[
+        Float64[Tensor, "B N M R E"], Float64[Tensor, "B N M R"], Float64[Tensor, "B N M R"]
+    ]:
+        """Each step's own rows: ∂h/∂δ, residuals and variances; a row of zeros with variance 1
+        where nothing was measured."""
+        alone = nobody(path[..., : self.process.dim])
+        rows = [self._rows(m.linearize(self.process, path, leaves, alone)) for m in self.models]
+        jacobian, residual, variance = (torch.cat(parts, 3) for parts in zip(*rows, strict=True))
+        return jacobian, residual, variance
+
+    def _rows(self, block: Block) -> tuple[Tensor, Tensor, Tensor]:
+        there, variance = block.mask.unsqueeze(-1), block.variance
+        if self.robust:
+            variance = variance / huber_weights(block).unsqueeze(-1)
+        residual = torch.where(there, block.residual, 0.0).flatten(-2)
+        variance = torch.where(there, variance, 1.0).flatten(-2)
+        jacobian = torch.where(there.unsqueeze(-1), block.jacobian, 0.0).flatten(-3, -2)
+        return jacobian, residual, variance
+
+    def _trilaterated(self, leaves: Observation) -> Float64[Tensor, "B N d"]:
+        """Where all ranges of the window, taken as of one place, meet: z² = ‖p‖² − 2 a·p + ‖a‖² is
+        linear in (p, ‖p‖²). The arena's centre without anchors."""
+        d, arena = self.process.dim, self.believed.arena
+        centre = leaves["prior"].new_tensor(arena.centre).double()
+        if self.believed.sensor(AnchorRanging) is None:
+            return centre.expand(*leaves["prior"].shape[:2], d)
+        anchors = leaves["anchor_map"].double().unflatten(-1, (-1, d)) - centre
+        ranges = leaves["anchor_ranges"].double().unflatten(-1, (-1, anchors.shape[-2]))
+        there = leaves["anchor_range_mask"].double().unflatten(-1, ranges.shape[-2:])
+        ones = torch.ones_like(anchors[..., :1])
+        design = torch.cat((-2 * anchors, ones), -1).unsqueeze(-3)
+        design = (design * there.unsqueeze(-1)).flatten(2, 4)
+        target = ((ranges.square() - anchors.square().sum(-1).unsqueeze(-2)) * there).flatten(2)
+        ridge = torch.full_like(design[..., 0, :], _RIDGE)
+        ridge[..., -1] = _RIDGE**2
+        normal = design.mT @ design + torch.diag_embed(ridge)
+        found = torch.linalg.solve(normal, (design.mT @ target.unsqueeze(-1))[..., 0])
+        return centre + found[..., :d]

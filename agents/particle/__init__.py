@@ -1,0 +1,1 @@
+"""Particle filters and their parts: the cloud, its likelihood, resampling and tempering."""

@@ -1,0 +1,120 @@
+"""Has a filter failed? Detectors that look at an estimate and at the distances to anchors."""
+
+from abc import ABC, abstractmethod
+from copy import deepcopy
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float32
+from scipy.stats import chi2
+from torch import Tensor
+from torch.nn import functional
+
+from agents.models.measurements import AnchorRanges, nobody
+from agents.models.process import Process
+from agents.weights import Learned
+from coloc_env.observation import Observation
+
+ANCHORS = 4  # residuals that the network looks at
+HIDDEN = (10, 5)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What distances to A anchors (of all tags) say of an estimate: d = rᵀ R⁻¹ r of the residuals
+    r = z − h(x̂), their sizes (m; 0 where nothing was measured), and how many there are."""
+
+    distance: Float32[Tensor, "B N"]
+    residuals: Float32[Tensor, "B N A"]
+    count: Float32[Tensor, "B N"]
+
+
+def evidence(
+    model: AnchorRanges,
+    process: Process,
+    state: Float[Tensor, "B N S"],
+    observation: Observation,
+) -> Evidence:
+    """The evidence about a state (its position alone, unless tags have lever arms)."""
+    alone = nobody(state[..., : process.dim])
+    if model.tags:
+        block = model.linearize(process, state, observation, alone, derivatives=False)
+        residual, mask = block.residual[..., 0] * block.mask, block.mask
+        squared = residual.square() / block.variance[..., 0]
+    else:
+        ranges, anchors = model.ends(observation, alone)
+        distance = (state[..., None, : process.dim] - anchors).norm(dim=-1)
+        mask = observation["anchor_range_mask"] > 0
+        residual = (ranges - distance) * mask
+        squared = residual.square() / model.variance
+    return Evidence(squared.sum(-1).float(), residual.abs().float(), mask.sum(-1).float())
+
+
+class Detector(ABC):
+    """Tells from evidence whether a filter has failed."""
+
+    @abstractmethod
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        """The probability that it has; a test that knows no probabilities says 0 or 1."""
+
+
+class ChiSquare(Detector):
+    """Failed if d is beyond the quantile of χ² with as many degrees of freedom as ranges."""
+
+    def __init__(self, quantile: float, most: int) -> None:
+        if not 0 < quantile < 1:
+            raise ValueError(f"quantile={quantile} is not allowed: a probability in (0, 1)")
+        limits = chi2.ppf(quantile, range(1, most + 1))
+        self.limits = torch.tensor((torch.inf, *limits))
+
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        limits = self.limits.to(seen.count.device)[seen.count.long()]
+        return (seen.distance > limits).float()
+
+
+class FailureDetector(Learned):
+    """5–10–5–2 network (tanh, softmax) on [d, |r₁| … |r₄|]: logits of (sound, failed).
+
+    d enters as log(1 + d), whose scale does not depend on R as much.
+    """
+
+    kind = "nnhpff"
+    features = ("log1p_d", "r1", "r2", "r3", "r4")
+
+    def __init__(self) -> None:
+        super().__init__()
+        sizes = (1 + ANCHORS, *HIDDEN)
+        self.hidden = torch.nn.ModuleList(map(torch.nn.Linear, sizes, sizes[1:]))
+        self.out = torch.nn.Linear(HIDDEN[-1], 2)
+
+    def forward(self, features: Float[Tensor, "*s 5"]) -> Float[Tensor, "*s 2"]:
+        x = features
+        for layer in self.hidden:
+            x = torch.tanh(layer(x))
+        logits: Tensor = self.out(x)
+        return logits
+
+
+def network_features(seen: Evidence) -> Float32[Tensor, "B N 5"]:
+    """The network's input: with more than four ranges the four largest residuals and d of four out
+    of so many; with fewer, zeros."""
+    d, residuals = seen.distance, seen.residuals
+    d = d * (ANCHORS / seen.count.clamp_min(1.0))
+    if residuals.shape[-1] > ANCHORS:
+        residuals = residuals.topk(ANCHORS, -1).values
+    missing = ANCHORS - residuals.shape[-1]
+    residuals = functional.pad(residuals, (0, missing)) if missing > 0 else residuals
+    return torch.cat((d.log1p().unsqueeze(-1), residuals), -1)
+
+
+class NeuralDetector(Detector):
+    """Failure by the network's probability."""
+
+    def __init__(self, network: FailureDetector) -> None:
+        self.network = deepcopy(network).double().requires_grad_(False)
+
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        # In float64, so that the order of sums, which depends on the batch, shows nowhere.
+        logits = self.network(network_features(seen).double())
+        failed = torch.sigmoid(logits[..., 1] - logits[..., 0]).float()
+        return failed * (seen.count > 0)

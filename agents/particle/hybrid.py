@@ -1,0 +1,197 @@
+"""Hybrid filters: a main one, a detector of its failure, and an auxiliary one to restart it from.
+
+NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filter.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.localizer import Estimate, Localizer, make, register
+from agents.models.measurements import AnchorRanges
+from agents.models.process import make_process
+from agents.particle.failure import ChiSquare, Detector, FailureDetector, NeuralDetector, evidence
+from agents.tensorclasses import build
+from agents.weights import learned
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+from coloc_env.sensors import AnchorRanging
+
+
+class HybridBelief(TensorClass):
+    """Both filters' beliefs, the Mahalanobis distance d and the probability of a failure that were
+    found last, for how many steps in a row it counts as failed, and whether the main filter was
+    begun anew in the last; batch (B, N)."""
+
+    main: Any
+    auxiliary: Any
+    distance: Float32[Tensor, "B N"]
+    probability: Float32[Tensor, "B N"]
+    alarms: Int64[Tensor, "B N"]
+    reset: Bool[Tensor, "B N"]
+
+
+class HybridFilter(Localizer[HybridBelief]):
+    """Any main filter, restarted from any auxiliary one where a detector finds that it has failed.
+
+    ``main`` is a filter that can be begun anew (particle and Kalman filters), ``auxiliary`` one
+    that gives a Gaussian; both are named with their options (``pf@particles=2000``).
+    ``threshold``: the probability beyond which a failure counts; 1: never. ``patience``: for so
+    many steps in a row it must count before anything is restarted. An auxiliary that finds itself
+    outside the arena, or knows no more than that it is inside, restarts nothing.
+    """
+
+    name = "hybrid"
+
+    def __init__(
+        self,
+        believed: Believed,
+        detector: Detector,
+        main: str,
+        auxiliary: str,
+        threshold: float,
+        patience: int,
+    ) -> None:
+        super().__init__(believed)
+        sensor = believed.sensor(AnchorRanging)
+        if sensor is None:
+            raise ValueError("the team has no distances to anchors to judge its filter by")
+        if not 0 <= threshold <= 1:
+            raise ValueError(f"threshold={threshold} is not allowed: a probability in [0, 1]")
+        if patience < 1:
+            raise ValueError(f"patience={patience} is not allowed: at least 1 step")
+        self.main: Localizer[Any] = make(main.replace("@", ":"), believed)
+        self.auxiliary: Localizer[Any] = make(auxiliary.replace("@", ":"), believed)
+        if type(self.main).restarted is Localizer.restarted:
+            raise ValueError(f"main={main!r} is not allowed: a particle or Kalman filter")
+        if type(self.auxiliary).gaussian is Localizer.gaussian:
+            raise ValueError(f"auxiliary={auxiliary!r} is not allowed: emvf or a Kalman filter")
+        self.detector, self.threshold, self.patience = detector, threshold, patience
+        self.process, self.model = make_process(believed), AnchorRanges(sensor)
+        arena = (believed.arena.low, believed.arena.high)
+        self._low, self._high = (torch.tensor(end, dtype=torch.float64) for end in arena)
+        self._anywhere = float((self._high - self._low).square().sum()) / 12
+
+    @property
+    def exchanges(self) -> bool:
+        return self.main.exchanges or self.auxiliary.exchanges
+
+    def reset(self, observation: Observation) -> HybridBelief:
+        nothing = torch.zeros_like(observation["prior"][..., 0])
+        return HybridBelief(
+            main=self.main.reset(observation),
+            auxiliary=self.auxiliary.reset(observation),
+            distance=nothing,
+            probability=nothing,
+            alarms=torch.zeros_like(nothing, dtype=torch.int64),
+            reset=nothing > 0,
+            batch_size=nothing.shape,
+        )
+
+    def step(self, belief: HybridBelief, observation: Observation) -> tuple[HybridBelief, Estimate]:
+        main, estimate = self.main.step(belief.main, observation)
+        auxiliary = self.auxiliary.watch(belief.auxiliary, observation)
+        seen = evidence(self.model, self.process, self._state(main, estimate), observation)
+        probability = self.detector.probability(seen)
+        alarms = (belief.alarms + 1) * (probability > self.threshold)
+        rows = alarms >= self.patience
+        if bool(rows.any()):
+            state, covariance = self.auxiliary.gaussian(auxiliary, observation)
+            d = self.process.dim
+            spread, like = covariance[..., :d, :d], estimate.position
+            rows = rows & self._usable(state[..., :d], spread)
+            main = self.main.restarted(main, rows, state, covariance)
+            row = rows.unsqueeze(-1)
+            estimate = Estimate(
+                position=torch.where(row, state[..., :d].to(like), like),
+                velocity=torch.where(row, state[..., d : 2 * d].to(like), estimate.velocity),
+                covariance=torch.where(row.unsqueeze(-1), spread, estimate.covariance),
+                batch_size=rows.shape,
+            )
+        after = build(
+            HybridBelief,
+            rows.shape,
+            main=main,
+            auxiliary=auxiliary,
+            distance=seen.distance,
+            probability=probability,
+            alarms=alarms * ~rows,
+            reset=rows,
+        )
+        return after, estimate
+
+    def mean(self, belief: HybridBelief) -> Float[Tensor, "B N S"]:
+        return self.main.mean(belief.main)
+
+    def moved(self, belief: HybridBelief, offset: Float[Tensor, "B N d"]) -> HybridBelief:
+        return belief.replace(main=self.main.moved(belief.main, offset))
+
+    def diagnostics(self, belief: HybridBelief) -> dict[str, Float[Tensor, "B N"]]:
+        return self.main.diagnostics(belief.main) | {
+            "mahalanobis": belief.distance,
+            "failure": belief.probability,
+            "resets_per_run": belief.reset.float(),
+        }
+
+    def _usable(
+        self, position: Float[Tensor, "B N d"], covariance: Float[Tensor, "B N d d"]
+    ) -> Bool[Tensor, "B N"]:
+        """Whether an auxiliary's position is one to begin anew from."""
+        low, high = (end.to(position.device) for end in (self._low, self._high))
+        inside = ((position >= low) & (position <= high)).all(-1)
+        return inside & (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) < self._anywhere)
+
+    def _state(self, main: Any, estimate: Estimate) -> Float[Tensor, "B N S"]:
+        """What distances to anchors need to know of the main filter's state."""
+        if self.model.tags:
+            return self.main.mean(main)
+        return estimate.position
+
+
+@register("hpff")
+class Hpff(HybridFilter):
+    """Hybrid particle/FIR filter: a failure is a Mahalanobis distance of the ranges beyond the
+    ``quantile`` of χ² (one degree of freedom a range)."""
+
+    name = "hpff"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        main: str = "pf",
+        auxiliary: str = "emvf",
+        quantile: float = 0.98,
+        patience: int = 1,
+    ) -> None:
+        sensor = believed.sensor(AnchorRanging)
+        most = 0 if sensor is None else len(sensor.anchors) * sensor.n_tags
+        super().__init__(believed, ChiSquare(quantile, most), main, auxiliary, 0.5, patience)
+
+
+@register("nnhpff")
+class NeuralHpff(HybridFilter):
+    """Hybrid particle/FIR filter: a failure is what a 5–10–5–2 network gives a probability above
+    ``threshold``. ``weights``: a checkpoint's name or path, or ``none``."""
+
+    name = "nnhpff"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        main: str = "pf",
+        auxiliary: str = "emvf",
+        weights: str = "nnhpff",
+        threshold: float = 0.5,
+        patience: int = 1,
+    ) -> None:
+        network = learned(FailureDetector, weights).requires_grad_(False)
+        super().__init__(believed, NeuralDetector(network), main, auxiliary, threshold, patience)
+
+    def learn(self, network: FailureDetector) -> None:
+        """Judge by this network from now on."""
+        self.detector = NeuralDetector(network)

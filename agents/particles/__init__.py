@@ -1,1 +1,0 @@
-"""Particle filtering in parts: the cloud, its likelihood, resampling and tempering."""

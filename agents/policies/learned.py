@@ -1,0 +1,155 @@
+"""Policies that were learned in the environment, as localizers like any other."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float32
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.localizer import Estimate, Localizer, register
+from agents.policies.actor import Actor
+from agents.weights import card_of, drawn_from, load
+from agents.wrappers.correction import Correction
+from coloc_env.envs.actions import ActionMode
+from coloc_env.envs.displacement import Displacement
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+
+
+def mode_of(believed: Believed, settings: dict[str, Any]) -> ActionMode:
+    """The action mode that a card's ``mode`` describes; ValueError if it describes none."""
+    kinds: dict[Any, Any] = {kind.name: kind for kind in (Correction, Displacement)}
+    options = dict(settings)
+    kind = options.pop("name", None)
+    if kind not in kinds:
+        raise ValueError(f"action mode {kind!r} is not one that policies have: {', '.join(kinds)}")
+    try:
+        mode: ActionMode = kinds[kind](believed, **options)
+    except TypeError as error:
+        raise ValueError(f"action mode {kind!r}: {error}") from None
+    return mode
+
+
+def inputs_of(mode: ActionMode) -> dict[str, int]:
+    """What a policy reads in a mode: leaves and their widths."""
+    leaves = mode.leaves
+    return {name: leaves[name].width for name in mode.features}
+
+
+def actor_for(mode: ActionMode, **options: Any) -> Actor:
+    """An untrained network for a mode; ``options`` as ``Actor`` has them."""
+    return Actor(mode.settings, inputs_of(mode), mode.dim, **options)
+
+
+class PolicyBelief(TensorClass):
+    """The action mode's memory (with a base localizer's belief) and the network's; batch (B, N)."""
+
+    mode: Any
+    network: Float32[Tensor, "B N m"]
+
+
+class PolicyAgent(Localizer[PolicyBelief]):
+    """A learned policy that takes its best action at every step.
+
+    ``weights``: a checkpoint's name or path, which also says in which action mode it acts and on
+    which base; ``none``: an untrained network that corrects an ``ekf``.
+    """
+
+    name = "policy"
+
+    def __init__(self, believed: Believed, *, weights: str) -> None:
+        super().__init__(believed)
+        if weights == "none":
+            self.mode: ActionMode = Correction(believed)
+            with drawn_from(0):
+                self.actor = actor_for(self.mode)
+        else:
+            card = card_of(weights)
+            if card["kind"] != Actor.kind:
+                raise ValueError(
+                    f"{weights} holds weights of kind {card['kind']!r}: a policy's are needed"
+                )
+            try:
+                with drawn_from(0):
+                    self.actor = Actor(**card["architecture"])
+            except (AttributeError, KeyError, TypeError) as error:
+                raise ValueError(f"{weights}: its card describes no policy: {error}") from None
+            self.mode = mode_of(believed, self.actor.architecture["mode"])
+            known, given = self.actor.architecture["inputs"], inputs_of(self.mode)
+            if known != given:
+                raise ValueError(
+                    f"{weights} was trained on the leaves {_words(known)}: this scenario has "
+                    f"{_words(given)}"
+                )
+            load(weights, self.actor)
+        self.actor.requires_grad_(False)
+
+    @classmethod
+    def of(cls, believed: Believed, actor: Actor, mode: ActionMode) -> "PolicyAgent":
+        """One with a network at hand, whose training it follows."""
+        agent = cls.__new__(cls)
+        Localizer.__init__(agent, believed)
+        agent.mode, agent.actor = mode, actor
+        return agent
+
+    def reset(self, observation: Observation) -> PolicyBelief:
+        prior = observation["prior"]
+        return PolicyBelief(
+            mode=self.mode.reset(observation),
+            network=prior.new_zeros(*prior.shape[:2], self.actor.memory_size),
+            batch_size=prior.shape[:2],
+        )
+
+    @torch.no_grad()
+    def step(self, belief: PolicyBelief, observation: Observation) -> tuple[PolicyBelief, Estimate]:
+        memory, leaves = self.mode.observe(belief.mode, observation)
+        seen = torch.cat([leaves[name] for name in self.mode.features], -1)
+        action, network = self.actor.act(seen, belief.network)
+        memory, estimate = self.mode.estimate(memory, action)
+        d = self.mode.dim
+        after = PolicyBelief(mode=memory, network=network, batch_size=belief.batch_size)
+        return after, Estimate(
+            position=estimate[..., :d],
+            velocity=estimate[..., d : 2 * d],
+            covariance=torch.diag_embed((2 * estimate[..., 2 * d :]).exp()),
+            batch_size=belief.batch_size,
+        )
+
+    @property
+    def exchanges(self) -> bool:
+        return isinstance(self.mode, Correction) and self.mode.base.exchanges
+
+
+def _words(inputs: dict[str, Any]) -> str:
+    return ", ".join(f"{name}[{width}]" for name, width in inputs.items())
+
+
+@register("mappo")
+class Mappo(PolicyAgent):
+    """A policy trained by ``coloc train mappo``. ``weights``: a checkpoint's name or path."""
+
+    name = "mappo"
+
+    def __init__(self, believed: Believed, *, weights: str = "mappo") -> None:
+        super().__init__(believed, weights=weights)
+
+
+@register("ippo")
+class Ippo(PolicyAgent):
+    """A policy trained by ``coloc train ippo``. ``weights``: a checkpoint's name or path."""
+
+    name = "ippo"
+
+    def __init__(self, believed: Believed, *, weights: str = "ippo") -> None:
+        super().__init__(believed, weights=weights)
+
+
+@register("sb3-ppo")
+class Sb3Ppo(PolicyAgent):
+    """A policy trained by ``coloc train sb3-ppo``. ``weights``: a checkpoint's name or path."""
+
+    name = "sb3-ppo"
+
+    def __init__(self, believed: Believed, *, weights: str = "sb3-ppo") -> None:
+        super().__init__(believed, weights=weights)

@@ -1,0 +1,1 @@
+"""Estimators in an environment's loop."""

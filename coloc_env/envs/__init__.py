@@ -1,0 +1,1 @@
+"""The faces of World: PettingZoo, TorchRL, stable-baselines3, Gymnasium, and what they share."""

@@ -1,0 +1,205 @@
+"""Action modes: what an action means, what an agent sees for it, and the error for a wrong one.
+
+The world scores estimates, whatever the mode: a mode turns actions into them. Filters act in
+``estimate``; learners in ``displacement`` (``coloc_env.envs.displacement``) or with corrections
+on a localizer (``agents.with_base``).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
+
+from coloc_env.observation import Observation, action_bounds, all_leaves, state_bounds
+from coloc_env.scenario import Believed, Scenario
+from coloc_env.sensors.base import Leaf
+from coloc_env.world import World
+
+Leaves = dict[str, Float32[Tensor, "B N F"]]
+FARTHEST = 100.0  # m: errors beyond are cut in the privileged state, whose bounds are finite
+
+
+class ActionMode(ABC):
+    """What an action is, to a team with some beliefs: pure functions of a memory, batch (B, N).
+
+    A memory is a tensorclass of batch (B, N) that holds all there is from step to step (None if
+    there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
+    what the mode adds to each UAV's observation, ``features`` those that a policy should read,
+    ``meaning`` the words for an action in error messages.
+    """
+
+    name: ClassVar[str]
+    meaning: ClassVar[str]
+    features: tuple[str, ...] = ()
+
+    def __init__(self, believed: Believed) -> None:
+        self.believed = believed
+        self.dim = believed.arena.dim
+
+    @property
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Lowest and highest numbers of one UAV's action: ±1 for each axis."""
+        return [-1.0] * self.dim, [1.0] * self.dim
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What describes it, beside the beliefs."""
+        return {"name": self.name}
+
+    @property
+    def leaves(self) -> dict[str, Leaf]:
+        """What it adds to an observation."""
+        return {}
+
+    def reset(self, observation: Observation) -> Any:
+        """The memory before the first observation is used."""
+        return None
+
+    def observe(self, memory: Any, observation: Observation) -> tuple[Any, Leaves]:
+        """Use an observation: the memory with it, and the leaves that it adds."""
+        return memory, {}
+
+    @abstractmethod
+    def estimate(
+        self, memory: Any, action: Float32[Tensor, "B N a"]
+    ) -> tuple[Any, Float32[Tensor, "B N A"]]:
+        """The memory after an action, and the estimate ``[position (m), velocity (m/s), log-std]``
+        that it stands for."""
+
+    def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
+        """The position (m) that actions are relative to; None where they are not."""
+        return None
+
+
+class Estimates(ActionMode):
+    """The estimate itself, as localizers give it. (Values beyond ``bounds`` are scored as well.)"""
+
+    name = "estimate"
+    meaning = "[position, velocity, log-std]"
+
+    @property
+    def bounds(self) -> tuple[list[float], list[float]]:
+        return action_bounds(self.believed.arena)
+
+    def estimate(
+        self, memory: None, action: Float32[Tensor, "B N A"]
+    ) -> tuple[None, Float32[Tensor, "B N A"]]:
+        return None, action
+
+
+class Pilot:
+    """An action mode at work in the worlds of one environment: it keeps their memory."""
+
+    def __init__(self, mode: ActionMode, world: World) -> None:
+        self.mode, self.world = mode, world
+        self.width = len(mode.bounds[0])
+        self._silent = not mode.leaves and type(mode).reset is ActionMode.reset
+        self._begun = False
+        self._memory: Any = None
+        self._leaves: Leaves = {}
+
+    def reset(self, rows: Bool[Tensor, "B"] | None = None) -> Leaves:
+        """Start the rows that have been reset anew (None: all) and return every row's leaves at
+        the current step."""
+        if self._silent:
+            return {}
+        observation = self.world.observation()
+        fresh, leaves = self.mode.observe(self.mode.reset(observation), observation)
+        if rows is not None and self._begun and not bool(rows.all()):
+            chosen = rows[:, None].expand(observation.batch_size)
+            fresh = None if fresh is None else fresh.where(chosen, self._memory)
+            leaves = {
+                name: torch.where(chosen.unsqueeze(-1), leaf, self._leaves[name])
+                for name, leaf in leaves.items()
+            }
+        self._memory, self._leaves, self._begun = fresh, leaves, True
+        return leaves
+
+    def observe(self) -> Leaves:
+        """The leaves at the step that the worlds have moved to."""
+        if not self._silent:
+            observation = self.world.observation()
+            self._memory, self._leaves = self.mode.observe(self._memory, observation)
+        return self._leaves
+
+    def estimate(self, action: Float32[Tensor, "B N a"]) -> Float32[Tensor, "B N A"]:
+        """The estimates that actions stand for."""
+        self._memory, estimates = self.mode.estimate(self._memory, action)
+        return estimates
+
+    def state(self) -> Float32[Tensor, "B S"]:
+        """What a critic may know: the truth, and the error in m of what actions are relative to,
+        if they are."""
+        truth, reference = self.world.state(), self.mode.reference(self._memory)
+        if reference is None:
+            return truth
+        error = (reference - self.world.now.target).clamp(-FARTHEST, FARTHEST)
+        return torch.cat((truth, error.flatten(-2)), -1)
+
+
+def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
+    """A mode by name (``estimate``, ``displacement``), or the one given. ValueError for another
+    name, or for a mode that was made for another scenario."""
+    if isinstance(action, ActionMode):
+        if action.believed is not scenario.believed:
+            raise ValueError(f"{scenario.name}: the action mode was made for another scenario")
+        return action
+    if action == Estimates.name:
+        return Estimates(scenario.believed)
+    if action == "displacement":
+        from coloc_env.envs.displacement import (
+            Displacement,  # takes a second that filters need not wait
+        )
+
+        return Displacement(scenario.believed)
+    raise ValueError(f"action={action!r} is not allowed: estimate, displacement, or an ActionMode")
+
+
+def observed_leaves(scenario: Scenario, mode: ActionMode) -> dict[str, Leaf]:
+    """Every leaf of an observation in this mode, in the order of the spaces."""
+    return all_leaves(scenario) | mode.leaves
+
+
+def chosen_leaves(
+    scenario: Scenario, mode: ActionMode, wanted: Sequence[str] | None
+) -> dict[str, Leaf]:
+    """The leaves of a flat observation: those wanted, else those that the mode recommends, else
+    all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
+    not end together."""
+    known = observed_leaves(scenario, mode)
+    names = tuple(wanted or mode.features or known)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")
+    if scenario.failure_rate or scenario.failures:
+        raise ValueError(f"{scenario.name}: UAVs that fail do not fit rows of one UAV each")
+    return {name: known[name] for name in names}
+
+
+def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:
+    """Bounds of the flat state: the truth's, and those of the error that goes with the mode."""
+    low, high = state_bounds(scenario)
+    if type(mode).reference is not ActionMode.reference:
+        more = scenario.arena.n_uavs * mode.dim
+        low, high = low + [-FARTHEST] * more, high + [FARTHEST] * more
+    return low, high
+
+
+def check(scenario: Scenario, mode: ActionMode, actions: Tensor, worlds: int) -> None:
+    """Raise a ValueError for actions of a wrong shape or with values that are not finite."""
+    shape = (worlds, scenario.arena.n_uavs, len(mode.bounds[0]))
+    if tuple(actions.shape) != shape:
+        raise ValueError(
+            f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
+            f"(worlds, UAVs, {mode.meaning}) is needed with action={mode.name}"
+        )
+    finite = actions.isfinite()
+    if not bool(finite.all()):
+        row, uav, _ = (~finite).nonzero()[0].tolist()
+        raise ValueError(
+            f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; every "
+            "number must be finite"
+        )

@@ -1,0 +1,173 @@
+"""The stable-baselines3 face: every UAV of B worlds an environment of a ``VecEnv``."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from jaxtyping import Float32
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+from torch import Tensor
+
+from coloc_env.envs.actions import ActionMode, Pilot, chosen_leaves, make_mode
+from coloc_env.observation import box, flat_box
+from coloc_env.render import Renderer
+from coloc_env.scenario import Scenario
+from coloc_env.scenarios import scenario_from
+from coloc_env.world import World
+
+Array = NDArray[np.float32]
+
+
+class Slot:
+    """One UAV of one world, as ``get_attr``, ``set_attr`` and ``env_method`` see it."""
+
+    def __init__(self, env: "CoLocVecEnv", world: int, uav: int) -> None:
+        self._env, self.world, self.uav = env, world, uav
+        self.agent, self.scenario = f"uav_{uav}", env.scenario
+        self.render_mode = env.mode_of_rendering
+
+    @property
+    def seed(self) -> int:
+        """Seed of the world that it is in."""
+        return int(self._env.world.seeds[self.world])
+
+    def state(self) -> Array:
+        """The privileged state of its world."""
+        self._env.started()
+        return self._env.pilot.state()[self.world].numpy().copy()
+
+
+class CoLocVecEnv(VecEnv):
+    """``num_worlds`` worlds of N UAVs as ``num_worlds`` · N environments that share a policy.
+
+    Index i is UAV i mod N of world i // N. Observations are flat: the ``leaves`` side by side
+    (default: those that the action mode recommends, else all). ``action``: ``estimate``,
+    ``displacement`` or an ``ActionMode`` (``agents.with_base(env, "ekf")`` for corrections on a
+    localizer). At the horizon every environment is truncated (``TimeLimit.truncated``,
+    ``terminal_observation``) and starts anew. World b starts with seed ``seed + b``, and moves on
+    by ``num_worlds`` an episode; ``seed(s)`` sets that for the next ``reset()``. (So does
+    stable-baselines3's ``PPO(seed=s)``: call ``seed`` after making the model.)
+
+    Raises ValueError where UAVs can fail: those of one world end together.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "indoor-v0",
+        num_worlds: int = 1,
+        seed: int = 0,
+        action: str | ActionMode = "estimate",
+        leaves: Sequence[str] | None = None,
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        scenario = scenario_from(scenario, overrides)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r} is not allowed: None, rgb_array")
+        self.scenario, self.mode = scenario, make_mode(scenario, action)
+        self.world = World(scenario, num_worlds)
+        self.pilot = Pilot(self.mode, self.world)
+        chosen = chosen_leaves(scenario, self.mode, leaves)
+        self.leaves, self._wanted = tuple(chosen), leaves
+        self.worlds, self.n_uavs = num_worlds, scenario.arena.n_uavs
+        self.mode_of_rendering = render_mode
+        self._renderer = None if render_mode is None else Renderer(scenario)
+        pairs = [(b, i) for b in range(num_worlds) for i in range(self.n_uavs)]
+        self.slots = [Slot(self, b, i) for b, i in pairs]
+        self._first_seed = self._next_seed = seed
+        super().__init__(len(self.slots), flat_box(chosen), box(self.mode.bounds))
+
+    def with_action(self, action: str | ActionMode) -> "CoLocVecEnv":
+        """The same environment, from its first episode on, in another action mode."""
+        return CoLocVecEnv(
+            self.scenario,
+            self.worlds,
+            self._first_seed,
+            action,
+            self._wanted,
+            self.mode_of_rendering,
+        )
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Take the worlds of seeds ``seed``, ``seed + 1``, … at the next reset (None: as if nothing
+        were said); the world's seed for each environment."""
+        if seed is not None:
+            self._next_seed = seed
+        return [self._next_seed + slot.world for slot in self.slots]
+
+    def reset(self) -> Array:
+        self.world.reset(self._next_seed)
+        self._next_seed += self.worlds
+        if self._renderer is not None:
+            self._renderer.reset()
+        return self._flat(self.pilot.reset())
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.started()
+        shape = (self.num_envs, self.pilot.width)
+        actions = np.asarray(actions, np.float32)
+        if actions.shape != shape or not np.isfinite(actions).all():
+            raise ValueError(
+                f"{self.scenario.name}: finite actions of shape {shape} are needed, each "
+                f"{self.mode.meaning}; got shape {actions.shape}"
+            )
+        self._actions = torch.from_numpy(actions).view(self.worlds, self.n_uavs, -1)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        estimates = self.pilot.estimate(self._actions)
+        if self._renderer is not None:
+            self._renderer.record(self.world, estimates[:1])
+        step = self.world.step(estimates)
+        observation = self._flat(self.pilot.observe())
+        infos: list[dict[str, Any]] = [{} for _ in self.slots]
+        over = bool(step.truncated[0])  # worlds start and end together
+        if over:
+            for info, last in zip(infos, observation, strict=True):
+                info["TimeLimit.truncated"] = True
+                info["terminal_observation"] = last
+            observation = self.reset()
+        rewards = step.reward.flatten().numpy().copy()
+        return observation, rewards, np.full(self.num_envs, over), infos
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self.slots[i], attr_name) for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        for i in self._get_indices(indices):
+            setattr(self.slots[i], attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        methods = self.get_attr(method_name, indices)
+        return [method(*method_args, **kwargs) for method in methods]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """The first world, if there is a render mode."""
+        if self._renderer is None:
+            return [None]
+        self.started()
+        return [self._renderer.render(self.world, "rgb_array")]
+
+    def started(self) -> None:
+        """ValueError before the first ``reset()``."""
+        if self.world.cursor < 0:
+            raise ValueError(f"{self.scenario.name}: call reset() first")
+
+    def _flat(self, leaves: dict[str, Float32[Tensor, "B N F"]]) -> Array:
+        """The chosen leaves at the current step, a row per UAV."""
+        seen = self.world.observation().leaves
+        parts = [leaves[name] if name in leaves else seen[name] for name in self.leaves]
+        return torch.cat(parts, -1).flatten(0, 1).numpy()

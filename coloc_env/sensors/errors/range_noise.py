@@ -1,0 +1,102 @@
+"""What a UWB range reads for a true distance: noise, bias, outliers and losses."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from coloc_env import noise
+from coloc_env.sensors.base import Window, require
+from coloc_env.sensors.errors.persistence import held_uniform
+
+
+@dataclass(frozen=True)
+class RangeNoise:
+    """Range = distance + noise, every number drawn from the link's own key.
+
+    - ``std``: Gaussian standard deviation in m; with probability ``tail`` it is ``tail_std``
+      instead (a heavy-tail mixture);
+    - ``uniform``: half width in m of an added uniform error;
+    - ``nlos``: probability, per link and step, of a positive bias: exponential with mean
+      ``nlos_bias`` m (``nlos_kind="exponential"``) or exactly that (``"constant"``);
+    - ``nlos_time``: seconds over which a link is in sight or not, a two-state Markov chain whose
+      correlation falls by e in that time (None: every step for itself); the size of an exponential
+      bias is drawn for every step in any case;
+    - ``impulse``: probability of a gross error, uniform within ±``impulse_size`` m;
+    - ``dropout``: probability that no range arrives.
+    """
+
+    std: float = 0.2
+    nlos: float = 0.0
+    nlos_bias: float = 1.0
+    nlos_kind: str = "exponential"
+    tail: float = 0.0
+    tail_std: float = 1.0
+    uniform: float = 0.0
+    impulse: float = 0.0
+    impulse_size: float = 10.0
+    dropout: float = 0.0
+    nlos_time: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("nlos", "tail", "impulse", "dropout"):
+            require(0 <= getattr(self, name) <= 1, self, name, "a probability in [0, 1]")
+        for name in ("std", "nlos_bias", "tail_std", "uniform", "impulse_size"):
+            require(0 <= getattr(self, name) < math.inf, self, name, "a size in m ≥ 0")
+        kinds = ("exponential", "constant")
+        require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
+        lasting = self.nlos_time is None or 0 < self.nlos_time < math.inf
+        require(lasting, self, "nlos_time", "a time in s > 0")
+
+    def obstructed(
+        self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
+    ) -> Bool[Tensor, "R K *l"] | None:
+        """Which of the numbered links are NLOS, ``latency`` steps before each of the window's; None
+        where every step is for itself."""
+        if self.nlos_time is None:
+            return None
+        first, count = window.steps[:, 0] - latency, window.steps.shape[1]
+        time = self.nlos_time / window.layout.arena.dt
+        return held_uniform(window.rows, first, count, links, f"{stream}.nlos", time) < self.nlos
+
+    def sample(
+        self,
+        distance: Float32[Tensor, "*s"],
+        keys: Int64[Tensor, "*s"],
+        stream: str,
+        blocked: Bool[Tensor, "*#s"] | None = None,
+        obstructed: Bool[Tensor, "*#s"] | None = None,
+    ) -> tuple[Float32[Tensor, "*s"], Bool[Tensor, "*s"] | None]:
+        """Ranges in m and which of them were lost (None: none can be); the bias of ``nlos`` always
+        strikes links that are ``blocked``, and otherwise those ``obstructed`` (None: by chance)."""
+
+        def chance(probability: float, name: str) -> Tensor:
+            return noise.uniform(keys, f"{stream}.{name}", 1)[..., 0] < probability
+
+        def draw(name: str) -> Tensor:
+            return noise.uniform(keys, f"{stream}.{name}", 1)[..., 0]
+
+        error = noise.normal(keys, stream, 1)[..., 0]
+        if self.tail:
+            error = error * torch.where(chance(self.tail, "tail"), self.tail_std, self.std)
+        else:
+            error = error * self.std
+        if self.uniform:
+            error = error + (2 * draw("uniform") - 1) * self.uniform
+        if self.nlos or blocked is not None:
+            size = torch.full_like(error, self.nlos_bias)
+            if self.nlos_kind == "exponential":
+                size = size * -draw("nlos.size").log()
+            if self.nlos or blocked is None:
+                late = chance(self.nlos, "nlos") if obstructed is None else obstructed
+                late = late if blocked is None else late | blocked
+            else:
+                late = blocked
+            error = error + torch.where(late, size, 0.0)
+        if self.impulse:
+            size = (2 * draw("impulse.size") - 1) * self.impulse_size
+            error = error + torch.where(chance(self.impulse, "impulse"), size, 0.0)
+        lost = chance(self.dropout, "dropout") if self.dropout else None
+        return error.add_(distance), lost

@@ -1,0 +1,151 @@
+"""Checkpoints: what is written is read back, and whatever is wrong with one is said in a line."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from agents.particle.corrector import WeightCorrector
+from agents.weights import Learned, load, shipped
+from training.learning.checkpoints import write
+
+
+class Other(Learned):
+    kind = "other"
+    features = WeightCorrector.features
+
+
+class Seeing(WeightCorrector):
+    features = ("dx", "dy", "dz", "range")
+
+
+class Wider(WeightCorrector):
+    def __init__(self) -> None:
+        super().__init__()
+        self.out = nn.Linear(13, 1)
+
+
+class Deeper(WeightCorrector):
+    def __init__(self) -> None:
+        super().__init__()
+        self.more = nn.Linear(1, 1)
+
+
+@pytest.fixture
+def corrector() -> WeightCorrector:
+    torch.manual_seed(1)
+    return WeightCorrector()
+
+
+@pytest.fixture
+def file(corrector: WeightCorrector, tmp_path: Path) -> Path:
+    write(tmp_path / "mine.safetensors", corrector, {"command": "none"})
+    return tmp_path / "mine.safetensors"
+
+
+def refused(source: str | Path, module: Learned) -> str:
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    with pytest.raises(ValueError, match=r".") as error:
+        load(source, module)
+    for name, value in module.state_dict().items():
+        assert torch.equal(value, before[name]), "written to before it was checked"
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize("ending", ["mine.safetensors", "mine"])
+def test_weights_come_back(corrector: WeightCorrector, file: Path, ending: str) -> None:
+    other = WeightCorrector()
+    weight = other.hidden.weight
+    card = load(file.parent / ending, other)
+    assert card["command"] == "none"
+    assert other.hidden.weight is weight, "in place: a filter that flies with it sees the change"
+    for name, value in corrector.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name])
+
+
+def test_every_shipped_checkpoint_says_how_it_was_trained() -> None:
+    for name in shipped():
+        folder = Path(__file__).parents[2] / "checkpoints"
+        card = json.loads((folder / f"{name}.json").read_text())
+        assert {"command", "options", "versions", "scores"} <= card.keys()
+        assert card["command"].startswith("coloc train ")
+
+
+def test_shipped_by_name() -> None:
+    assert load("pfnn", WeightCorrector())["kind"] == "pfnn"
+
+
+def test_missing(file: Path, corrector: WeightCorrector) -> None:
+    text = refused("pfn", corrector)
+    assert "did you mean 'pfnn'" in text
+    assert "./pfn.safetensors" in text
+    assert "none.safetensors: no such file" in refused(file.parent / "none", corrector)
+    file.with_suffix(".json").unlink()
+    assert "lacks its card mine.json" in refused(file, corrector)
+
+
+@pytest.mark.parametrize("how", ["truncated", "corrupted", "empty", "another's"])
+def test_damaged(file: Path, corrector: WeightCorrector, how: str) -> None:
+    data = file.read_bytes()
+    damaged = {
+        "truncated": data[:-7],
+        "corrupted": data[:-7] + bytes([data[-7] ^ 1]) + data[-6:],
+        "empty": b"",
+        "another's": data.replace(b"F32", b"I32"),
+    }[how]
+    file.write_bytes(damaged)
+    text = refused(file, corrector)
+    assert str(file) in text
+    assert "damaged" in text
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"kind": "pfnn"}', '{"kind": 1, "features": 2}'])
+def test_card_of_something_else(file: Path, corrector: WeightCorrector, text: str) -> None:
+    file.with_suffix(".json").write_text(text)
+    assert "mine.json" in refused(file, corrector)
+
+
+def test_foreign(file: Path) -> None:
+    assert "'pfnn': 'other' is needed" in refused(file, Other())
+    text = refused(file, Seeing())
+    assert "features dx, dy, dz, dvx, dvy, dvz" in text
+    assert "dx, dy, dz, range are needed" in text
+
+
+def test_other_shapes_and_numbers(file: Path, corrector: WeightCorrector) -> None:
+    wider = refused(file, Wider())
+    assert "out.weight is float32 [1, 12], float32 [1, 13] is needed" in wider
+    assert "more.weight" in refused(file, Deeper())
+    with torch.no_grad():
+        corrector.out.bias.fill_(float("nan"))
+    write(file, corrector, {})
+    assert "out.bias holds NaN" in refused(file, WeightCorrector())
+    write(file, corrector.double(), {})
+    assert "float64 [12, 6], float32 [12, 6] is needed" in refused(file, WeightCorrector())
+
+
+def test_a_pickle_is_not_opened(file: Path, corrector: WeightCorrector) -> None:
+    torch.save(corrector.state_dict(), file)
+    assert "damaged" in refused(file, corrector)
+    card = json.loads(file.with_suffix(".json").read_text())
+    import hashlib
+
+    card["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    file.with_suffix(".json").write_text(json.dumps(card))
+    assert "not a safetensors file" in refused(file, corrector)
+
+
+def test_nothing_half_written(
+    file: Path, corrector: WeightCorrector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
+    with pytest.raises(TypeError):
+        write(file, corrector, {"scores": object()})
+    save_file({"a": torch.zeros(1)}, file.parent / "b.safetensors")
+    (file.parent / "b.safetensors").unlink()
+    assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before

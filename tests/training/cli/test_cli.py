@@ -1,0 +1,197 @@
+"""The coloc command: what it writes and prints, and one clear line for whatever is wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from training.cli.command import app
+from training.evaluation.evaluate import split_agents
+from training.evaluation.results import FIGURES, NAMES
+
+SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]
+CHECKOUT = Path(__file__).parents[3]
+
+
+def coloc(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def evaluate(out: Path, *arguments: str) -> Result:
+    return coloc("evaluate", "indoor-v0", "--out", out, "--runs", "2", *SMALL, *arguments)
+
+
+def test_evaluate(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = evaluate(out, "--agents", "test_still,test_still:offset=0.5", "--seed", "5")
+    assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+    summary = json.loads((out / "results.json").read_text())
+    assert summary["overrides"] == {"n_uavs": 2, "horizon": 12}
+    assert (summary["seed"], summary["runs"], summary["steps"]) == (5, 2, 12)
+    assert list(summary["agents"]) == ["test_still", "test_still:offset=0.5"]
+    assert "test_still:offset=0.5" in done.stdout
+    assert f"written to {out}" in done.stdout
+    assert done.stderr == ""
+    again = evaluate(out, "--agents", "test_still", "--no-figures", "--no-bound")
+    assert again.exit_code == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted(set(NAMES) - set(FIGURES))
+    assert json.loads((out / "results.json").read_text())["bound"] == {"rmse": None}
+
+
+def test_what_raises_is_told(tmp_path: Path) -> None:
+    done = evaluate(tmp_path / "out", "--agents", "test_still:wrong=raises", "--no-figures")
+    assert done.exit_code == 0
+    assert done.stderr == (
+        "warning: test_still:wrong=raises raised in 2 of 2 runs; "
+        "first at step 0: RuntimeError: the matrix is singular\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evaluate", "indor-v0", "--agents", "ekf"], "did you mean 'indoor-v0'"),
+        (["evaluate", "indoor-v0", "--agents", "ekff"], "did you mean 'ekf'"),
+        (["evaluate", "indoor-v0", "--agents", "ekf:robst=huber"], "did you mean 'robust'"),
+        (["evaluate", "indoor-v0", "--agents", ","], "at least one"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--set", "landmark=3"], "'landmarks'"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--set", "dt=0"], "dt"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--set", "dt"], "key=value"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--runs", "0"], "runs=0"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--threads", "0"], "--threads 0"),
+        (["evaluate", "replay-mrclam-v0", "--agents", "ekf", "--data", "/no/where"], "/no/where"),
+        (["render", "indoor-v0", "--steps", "0"], "--steps 0"),
+        (["render", "indoor-v0", "--steps", "2000"], "1 to 1000"),
+        (["render", "indoor-v0", "--agent", "ekff"], "did you mean 'ekf'"),
+        (["scenarios", "indor-v0"], "did you mean 'indoor-v0'"),
+        (["agents", "ekff"], "did you mean 'ekf'"),
+    ],
+)
+def test_one_clear_line(
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLOC_DATA", str(tmp_path))
+    if arguments[0] in ("evaluate", "render"):
+        arguments = [*arguments, "--out", str(tmp_path / "deep" / "out.gif")]
+    done = coloc(*arguments)
+    assert done.exit_code == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_is_checked_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "training.evaluation.evaluate.evaluate", lambda *_, **__: pytest.fail("computed")
+    )
+    (tmp_path / "file").touch()
+    done = evaluate(tmp_path / "file" / "out", "--agents", "ekf")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == f"error: {tmp_path / 'file'} is not a folder\n"
+    done = coloc("render", "indoor-v0", "--out", tmp_path / "file" / "a.gif")
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    "where", ["training.evaluation.evaluate.evaluate", "training.evaluation.results.write"]
+)
+def test_an_interruption_leaves_nothing(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(where, interrupt)
+    done = evaluate(tmp_path / "deep" / "out", "--agents", "test_still", "--no-bound")
+    assert (done.exit_code, done.stdout, done.stderr) == (130, "", "interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("training.evaluation.results.write", full)
+    done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-bound")
+    assert done.exit_code == 2
+    assert done.stderr == "error: [Errno 28] No space left on device\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("name", "frames"), [("a.gif", 3), ("a.png", 1)])
+def test_render(name: str, frames: int, tmp_path: Path) -> None:
+    out = tmp_path / name
+    done = coloc("render", "indoor-v0", "--agent", "test_still", "--steps", "3", "--out", out)
+    assert done.exit_code == 0, done.output
+    with Image.open(out) as image:
+        assert getattr(image, "n_frames", 1) == frames
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_lists() -> None:
+    assert "indoor-v0" in coloc("scenarios").stdout
+    settings = coloc("scenarios", "indoor-v0").stdout
+    assert "landmark_radius" in settings
+    assert "30.0,20.0,5.0" in settings
+    assert "test_still" in coloc("agents").stdout
+    options = coloc("agents", "test_still").stdout
+    assert "offset" in options
+    assert "a number" in options
+
+
+@pytest.mark.parametrize(
+    ("text", "agents"),
+    [
+        ("ekf,pf500", ["ekf", "pf500"]),
+        (" ekf , pf500 ,", ["ekf", "pf500"]),
+        ("apf:bounds=100,800:start=300,ekf", ["apf:bounds=100,800:start=300", "ekf"]),
+        ("a:x=-1,-2,.5,b", ["a:x=-1,-2,.5", "b"]),
+        ("", []),
+    ],
+)
+def test_split_agents(text: str, agents: list[str]) -> None:
+    assert split_agents(text) == agents
+
+
+def test_help_teaches_and_is_instant() -> None:
+    heavy = "{'torch', 'matplotlib'}"
+    code = f"import sys, training.cli.command; assert not {heavy} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=CHECKOUT)
+    for command in ("evaluate", "render"):
+        assert f"coloc {command} indoor-v0 --agent" in coloc(command, "--help").stdout
+    assert "coloc scenarios" in coloc("--help").stdout
+
+
+def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "training.cli.command", "evaluate", "indoor-v0"]
+    command += ["--agents", "dead_reckoning", "--no-bound", "--out", str(tmp_path / "deep" / "out")]
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which shells' jobs are not
+    process = subprocess.Popen(
+        command, env=environment, cwd=tmp_path, stderr=subprocess.PIPE, preexec_fn=listening
+    )
+    try:
+        for _ in range(600):
+            time.sleep(0.05)
+            if (tmp_path / "deep").exists():
+                break
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert (process.returncode, errors) == (130, b"interrupted\n")
+    assert list(tmp_path.iterdir()) == []

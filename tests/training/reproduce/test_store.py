@@ -1,0 +1,149 @@
+"""The store: nothing is lost, nothing is mixed; and what a result is said to depend on."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from agents.localizer import Localizer, make
+from coloc_env.scenarios import make_scenario
+from training.reproduce import identity
+from training.reproduce.store import Store
+
+SETTINGS = {"agent": "ekf:robust=huber", "seed": 0, "overrides": {"room": (30.0, 20.0, 5.0)}}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def save(store: Store, settings: dict[str, object] = SETTINGS) -> Path:
+    arrays = {"error": np.arange(6, dtype=np.float32).reshape(2, 3), "broken": np.array([True])}
+    store.save("nlos/ekf:robust=huber-0+2", settings, arrays, {"raised": 1, "message": "a — b"})
+    return store.path("nlos/ekf:robust=huber-0+2", settings)
+
+
+def test_round_trip(store: Store) -> None:
+    assert not store.has("nlos/ekf:robust=huber-0+2", SETTINGS)
+    path = save(store)
+    assert path.parent.name == "nlos"
+    assert path.name.startswith("ekf_robust=huber-0+2-")
+    assert store.has("nlos/ekf:robust=huber-0+2", SETTINGS)
+    arrays, facts = store.load("nlos/ekf:robust=huber-0+2", SETTINGS)
+    assert arrays.keys() == {"error", "broken"}
+    assert arrays["error"].dtype == np.float32
+    np.testing.assert_array_equal(arrays["error"], [[0, 1, 2], [3, 4, 5]])
+    assert facts == {"raised": 1, "message": "a — b"}
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"code": "abc"}, {"agent": "ekf"}])
+def test_other_settings_are_another_piece(store: Store, change: dict[str, object]) -> None:
+    path = save(store)
+    other = SETTINGS | change
+    assert not store.has("nlos/ekf:robust=huber-0+2", other)
+    assert store.path("nlos/ekf:robust=huber-0+2", other) != path
+
+
+def test_mixed_settings_are_refused(store: Store) -> None:
+    other = SETTINGS | {"seed": 1}
+    save(store).rename(store.path("nlos/ekf:robust=huber-0+2", other))
+    with pytest.raises(ValueError, match="other settings"):
+        store.load("nlos/ekf:robust=huber-0+2", other)
+
+
+def test_damage_is_told(store: Store) -> None:
+    path = save(store)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match=re.escape(f"{path.name} is damaged")):
+        store.load("nlos/ekf:robust=huber-0+2", SETTINGS)
+
+
+def test_nothing_is_ever_half_written(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: Path, **arrays: object) -> None:
+        file.write_bytes(b"half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(KeyboardInterrupt):
+        save(store)
+    assert not store.has("nlos/ekf:robust=huber-0+2", SETTINGS)
+    assert not store.folder.exists()
+
+
+def closure(tmp_path: Path, text: str) -> str:
+    identity._read.cache_clear()
+    identity._closure.cache_clear()
+    file = tmp_path / "agent.py"
+    file.write_text(text)
+    return identity._closure((file,))
+
+
+def test_code_counts_and_words_do_not(tmp_path: Path) -> None:
+    plain = closure(tmp_path, "def f(x):\n    return x + 1\n")
+    worded = '"""A module."""\n\n\ndef f(x):\n    """Adds."""\n    return x + 1  # one\n'
+    assert closure(tmp_path, worded) == plain
+    assert closure(tmp_path, "def f(x):\n    return x + 2\n") != plain
+
+
+def test_code_of_what_is_imported_counts(tmp_path: Path) -> None:
+    alone = closure(tmp_path, "import math\n")
+    assert closure(tmp_path, "import cmath\n") != alone
+    code, imports = identity._read(Path(identity.__file__))
+    names = {file.name for file in imports}
+    assert "localizer.py" in names
+    assert "torch" not in {file.parent.name for file in imports}
+    assert "__init__.py" not in names  # agents/ only registers
+    assert "Hash of the code" not in code
+
+
+def test_agents_share_no_more_than_they_use() -> None:
+    room = make_scenario("indoor-v0", anchors=4)
+
+    def code(agent: str, *modules: str) -> str:
+        return identity.code_of(make(agent, room), *modules)
+
+    assert code("ekf") == code("ekf:robust=huber")
+    assert code("ekf") != code("pf500")
+    assert code("ekf") != code("ekf", "training.learning.pfnn_online")
+    assert code("hpff") != code("hpff:main=ekf")  # what it is made of counts
+    assert code("hpff") == code("hpff:main=pf500")
+
+
+def learned(scale: float, nested: bool) -> Localizer:
+    """A localizer with a network, or with one in a part of a part of it."""
+    localizer = make("ekf", make_scenario("indoor-v0"))
+    network = nn.Linear(2, 1)
+    with torch.no_grad():
+        network.weight.fill_(scale)
+        network.bias.zero_()
+    part = network
+    if nested:
+        part = make("ekf", make_scenario("indoor-v0"))
+        part.parts = [{"network": network, "itself": part}]
+    localizer.network = part
+    return localizer
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_weights(nested: bool) -> None:
+    assert identity.weights_of(make("ekf", make_scenario("indoor-v0"))) is None
+    one = identity.weights_of(learned(1.0, nested))
+    assert one is not None
+    assert identity.weights_of(learned(1.0, nested)) == one
+    assert identity.weights_of(learned(2.0, nested)) != one
+
+
+@pytest.mark.parametrize("agent", ["pfnn", "pfnn_trust", "ekf_trust"])
+def test_weights_of_learned_agents(agent: str) -> None:
+    scenario = make_scenario("indoor-v0")
+    one = make(agent, scenario, weights="none")
+    before = identity.weights_of(one)
+    assert before is not None
+    networks = [part for part in identity._parts(one, set()) if isinstance(part, nn.Module)]
+    with torch.no_grad():
+        next(networks[0].parameters()).add_(1.0)
+    assert identity.weights_of(one) != before

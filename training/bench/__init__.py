@@ -1,0 +1,1 @@
+"""coloc bench: how fast worlds, faces and localizers are, beside other environments."""

@@ -1,0 +1,209 @@
+"""``coloc bench``: how fast worlds, both faces and localizers are, beside other environments.
+
+One CPU thread. Everything is timed in turn, round after round, so that a neighbour on the machine
+slows all alike; the figure is the best round, the median beside it tells how noisy it was.
+"""
+
+import json
+import math
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from coloc_env.staging import staged_folder
+from training.bench.agents import TITLES, time_agents
+from training.bench.cases import Case, Timed, cases
+from training.bench.figures import FIGURES, draw
+from training.bench.learning import learning_cases
+from training.bench.peers import peers
+
+T = TypeVar("T")
+NAMES = (*FIGURES, "bench.json")
+_RATIOS = {  # ours to theirs, six agents each
+    "PettingZoo / mpe2": ("PettingZoo N=6", "mpe2 simple_spread B=1"),
+    "World / VMAS, B=1": ("World B=1", "VMAS simple_spread B=1"),
+    "World / VMAS, B=32": ("World B=32", "VMAS simple_spread B=32"),
+    "World / VMAS, B=1024": ("World B=1024", "VMAS simple_spread B=1024"),
+}
+_PACKAGES = ("coloc", "torch", "tensordict", "torchrl", "pettingzoo", "mpe2", "vmas")
+_MEMORY = """
+import torch
+from coloc_env.scenarios import make_scenario
+from coloc_env.world import World
+def peak(size):
+    world = World(make_scenario("indoor-v0"), size)
+    world.reset(0)
+    for _ in range(20):
+        world.step(torch.zeros(size, 6, 9))
+        world.observation()
+    status = open("/proc/self/status").read()
+    return int(status.split("VmHWM:")[1].split()[0])
+before = peak(1)
+print(peak(1024) - before)
+"""
+
+
+def bench(out: Path, quick: bool = False, agents: bool = True) -> None:
+    """Measure, print the tables, and write ``bench.json`` and figures into ``out``."""
+    with staged_folder(out, NAMES) as folder:
+        results = run_bench(quick, agents)
+        show(results)
+        draw(results, folder)
+        (folder / "bench.json").write_text(json.dumps(results, indent=1) + "\n")
+    Console().print(f"written to {out}", highlight=False)
+
+
+def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:
+    """All measurements as plain numbers.
+
+    ``environments``: per case the best and the median round in agent-steps per second, and the best
+    round's ms per step; ``ratios`` to peers where they are installed; ``memory_mb``: how much the
+    process grows for 1024 worlds; ``agents``, ``swarms``, ``relative``, ``particles``, ``teams``: a
+    team's step in ms; ``parts``: where it goes, in ms by part.
+    """
+    with _one_thread():
+        chosen = [*cases(), *learning_cases(), *peers()]
+        environments = _rounds(chosen, 1 if quick else 15)
+        localizers = time_agents(quick, _track) if agents else {}
+    best = {name: figures["agent_steps_per_s"] for name, figures in environments.items()}
+    return {
+        "machine": {
+            "processor": platform.processor() or platform.machine(),
+            "python": platform.python_version(),
+            "threads": 1,
+            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+            "versions": _versions(),
+        },
+        "quick": quick,
+        "environments": environments,
+        "ratios": {
+            name: best[ours] / best[theirs]
+            for name, (ours, theirs) in _RATIOS.items()
+            if theirs in best
+        },
+        "memory_mb": _memory(),
+        **localizers,
+    }
+
+
+def show(results: dict[str, Any]) -> None:
+    """Print what was measured."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = 120
+    rows = [
+        (name, _engineering(f["agent_steps_per_s"]), _engineering(f["median"]), f"{f['ms']:.3g}")
+        for name, f in results["environments"].items()
+    ]
+    header = ("", "agent-steps/s", "median", "ms a step")
+    console.print(_table(header, rows), highlight=False)
+    ratios = [(name, f"{ratio:.1f} ×") for name, ratio in results["ratios"].items()]
+    if results["memory_mb"] is not None:
+        ratios.append(("memory of 1024 worlds", f"{results['memory_mb']:.0f} MB"))
+    console.print(_table(("", "ratio"), ratios), highlight=False)
+    for key, title in TITLES.items():
+        lines = [(name, _ms(ms)) for name, ms in results.get(key, {}).items()]
+        if lines:
+            console.print(_table((title, "ms a team's step"), lines), highlight=False)
+    for name, parts in results.get("parts", {}).items():
+        total = sum(parts.values())
+        shares = [(part, _ms(ms), f"{ms / total:.0%}") for part, ms in parts.items()]
+        console.print(_table((name, "ms", "share"), shares), highlight=False)
+
+
+# ------------------------------------------------------------------ parts
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _rounds(chosen: Sequence[Case], rounds: int) -> dict[str, dict[str, float]]:
+    """Time all cases in turn, round after round, once more than counted to warm up."""
+    ready = [(case, case.setup()) for case in chosen]
+    seconds: dict[str, list[float]] = {case.key: [] for case in chosen}
+    for _ in _track(range(rounds + 1), "environments"):
+        for case, timed in ready:
+            seconds[case.key].append(_seconds(case, timed))
+    found = {}
+    for case in chosen:
+        counted = seconds[case.key][1:]
+        best = min(counted)
+        found[case.key] = {
+            "agent_steps_per_s": case.agents / best,
+            "median": case.agents / statistics.median(counted),
+            "ms": 1e3 * best,
+        }
+    return found
+
+
+def _seconds(case: Case, timed: Timed) -> float:
+    """Mean time of a step over whole windows."""
+    steps = timed.window * math.ceil(case.steps / timed.window)
+    start = time.perf_counter()
+    timed.run(steps)
+    return (time.perf_counter() - start) / steps
+
+
+def _track(items: Sequence[T], what: str) -> Iterable[T]:
+    """A progress bar on stderr, where that is a terminal."""
+    console = Console(stderr=True)
+    return track(items, what, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _memory() -> float | None:
+    """How many MB a fresh process grows at its peak for 1024 worlds; None where it cannot tell."""
+    if not sys.platform.startswith("linux"):
+        return None
+    command = [sys.executable, "-c", _MEMORY]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return int(told) * 1024 / 1e6
+
+
+def _versions() -> dict[str, str | None]:
+    def of(package: str) -> str | None:
+        try:
+            return version(package)
+        except PackageNotFoundError:
+            return None
+
+    return {package: of(package) for package in _PACKAGES}
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for i, title in enumerate(header):
+        table.add_column(title, justify="right" if i else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _engineering(value: float) -> str:
+    """Three digits and a unit: 86.2 k, 1.03 M."""
+    for scale, unit in ((1e6, " M"), (1e3, " k")):
+        if value >= scale:
+            return f"{value / scale:.3g}{unit}"
+    return f"{value:.3g}"
+
+
+def _ms(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"

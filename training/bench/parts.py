@@ -1,0 +1,117 @@
+"""Where the time of a localizer's step goes: its parts' own time, by watching the calls."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from agents import Localizer
+from coloc_env.scenario import Scenario
+from coloc_env.world import World
+
+PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pfnn_trust")
+REST = "rest"
+_STEPS, _WARM_UP = 200, 20
+_FUNCTIONS = {  # where a name is looked up: what its time is called
+    "agents.particle.pf.normal": "noise",
+    "agents.particle.resampling.normal": "noise",
+    "agents.particle.proposal.normal": "noise",
+    "agents.particle.tempering.normal": "noise",
+    "agents.particle.pf.heard": "messages",
+    "agents.particle.pf.log_likelihood": "likelihood",
+    "agents.particle.resampling.moments": "moments",
+    "agents.particle.proposal.moments": "moments",
+    "agents.particle.tempering.moments": "moments",
+    "agents.particle.resampling.systematic": "resampling",
+    "agents.particle.resampling.liu_west": "resampling",
+    "agents.particle.resampling.normalized": "weights",
+    "agents.particle.degeneracy.effective_sample_size": "weights",
+    "agents.particle.proposal.normalized": "weights",
+    "agents.particle.tempering.normalized": "weights",
+    "agents.particle.tempering.effective_sample_size": "weights",
+    "agents.particle.proposal.iterated_update": "Gaussian update",
+    "agents.particle.pf.proposed": "proposal",
+    "agents.particle.degeneracy.proposed": "proposal",
+    "agents.kalman.ekf.heard": "messages",
+    "agents.kalman.ekf.predict": "prediction",
+    "agents.models.update.information": "information",
+    "agents.models.update.posterior": "information",
+    "agents.trust.screen.innovation": "trust features",
+    "agents.trust.screen.features": "trust features",
+    "agents.trust.screen.huber_weights": "Huber weights",
+}
+_METHODS = {  # of a localizer and what it is made of
+    "process.propagate": "prediction",
+    "renewal.weigh": "weights",
+    "renewal.renew": "resampling",
+    "log_correction": "corrector network",
+    "screen.network.trust_vectors": "trust networks",
+    "screen.network.trust_ranges": "trust networks",
+}
+
+
+class Stopwatch:
+    """Own time of watched calls, in seconds by part: a part within a part is taken off it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.inner = [0.0]
+
+    def watched(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, its own time put down under ``part``."""
+
+        def call(*args: Any, **named: Any) -> Any:
+            self.inner.append(0.0)
+            start = time.perf_counter()
+            try:
+                return function(*args, **named)
+            finally:
+                whole = time.perf_counter() - start
+                self.seconds[part] += whole - self.inner.pop()
+                self.inner[-1] += whole
+
+        return call
+
+
+@torch.no_grad()
+def step_parts(localizer: Localizer, scenario: Scenario) -> dict[str, float]:
+    """Mean ms of each part of the whole team's step in one world; ``rest`` is what no part is."""
+    world, watch = World(scenario), Stopwatch()
+    observation = world.reset(0)
+    belief = localizer.reset(observation)
+    step = watch.watched(REST, localizer.step)
+    with _watching(localizer, watch):
+        for k in range(_WARM_UP + _STEPS):
+            if k == _WARM_UP:
+                watch.seconds.clear()
+            belief, estimate = step(belief, observation)
+            world.advance(estimate.action())
+            observation = world.observation()
+    ordered = sorted(watch.seconds.items(), key=lambda item: (item[0] == REST, -item[1]))
+    return {part: 1e3 * seconds / _STEPS for part, seconds in ordered}
+
+
+@contextmanager
+def _watching(localizer: Localizer, watch: Stopwatch) -> Iterator[None]:
+    """Every known part replaced by its watched self."""
+    with ExitStack() as stack:
+        for path, part in _FUNCTIONS.items():
+            mock = patch(path)
+            original, _ = mock.get_original()
+            stack.enter_context(patch(path, watch.watched(part, original)))
+        for path, part in _METHODS.items():
+            *owners, name = path.split(".")
+            owner: Any = localizer
+            for one in owners:
+                owner = getattr(owner, one, None)
+            if hasattr(owner, name):
+                watched = watch.watched(part, getattr(owner, name))
+                stack.enter_context(patch.object(owner, name, watched))
+        for model in getattr(localizer, "models", ()):
+            watched = watch.watched("linearization", model.linearize)
+            stack.enter_context(patch.object(model, "linearize", watched))
+        yield

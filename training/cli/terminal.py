@@ -1,0 +1,76 @@
+"""What commands print on a terminal: tables, explanations and bars of progress."""
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+_PIPED = 160  # columns of a table that no terminal shows
+
+
+def summary(function: Callable[..., Any]) -> str:
+    """The first paragraph of a docstring, in one line."""
+    return _paragraphs(function)[0]
+
+
+def _paragraphs(function: Callable[..., Any]) -> list[str]:
+    """A docstring's paragraphs, one line each; without a docstring, one that is empty."""
+    text = (inspect.getdoc(function) or "").replace("``", "")
+    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
+
+
+def explain(
+    name: str, known: Mapping[str, inspect.Parameter], kind: str, function: Callable[..., Any]
+) -> None:
+    """Print what ``function``, registered as ``name``, is by its docstring, and its ``known``
+    parameters, each a ``kind`` (a singular noun), with types and defaults."""
+    from coloc_env.options import describe
+    from training.evaluation.results import typed
+
+    text = "\n\n".join(map(escape, _paragraphs(function)))
+    Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
+    lines = [[key, describe(p.annotation), typed(p.default)] for key, p in known.items()]
+    if lines:
+        show([kind, "type", "default"], lines)
+    else:
+        typer.echo(f"no {kind}s")
+
+
+def show(header: list[str], lines: list[list[str]]) -> None:
+    """Print a table: a title a column, and lines of as many cells. Beyond three columns, all but
+    the first are numbers; where it must be narrowed, words give way to names and numbers."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    numbers = len(header) > 3
+    for i, title in enumerate(header):
+        right = numbers and i > 0
+        table.add_column(title, justify="right" if right else "left", no_wrap=right or i == 0)
+    for line in lines:
+        table.add_row(*map(escape, line))
+    console = Console()
+    if not console.is_terminal:
+        console.width = _PIPED
+    console.print(table, highlight=False)
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Bars on stderr, where that is a terminal. The block is given a function to be told a task's
+    name, how much of it is done, and of how much; each task has a bar of its own."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    hidden = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
+        tasks: dict[str, Any] = {}
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(escape(what), total=total)
+            bars.update(tasks[what], completed=done, total=total)
+
+        yield tell

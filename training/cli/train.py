@@ -1,0 +1,94 @@
+"""``coloc train``."""
+
+import logging
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.cli.terminal import explain, progress, show, summary
+
+
+def train(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[TRAINING]", help="What to train; none: list them.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Set one option of the training; repeat it for more. "
+            "**coloc train TRAINING** lists them.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="New folder for the run; starts it.")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of a run to continue.")
+    ] = None,
+    threads: Annotated[
+        int, typer.Option(help="CPU threads of torch; a run that continues keeps its own.")
+    ] = 1,
+) -> None:
+    """Train a learned part of an agent, or continue after an interruption.
+
+    DIR receives run.json (options, command, versions), metrics/ (CSV) and tensorboard/, and at the
+    end the weights, TRAINING.safetensors, with their card, TRAINING.json. A run that was
+    interrupted, however abruptly, continues with --resume to exactly the weights that it would have
+    had otherwise. Without --out and --resume the training's options are listed.
+
+    **Examples**
+
+    coloc train pfnn
+
+    coloc train pfnn --out runs/corrector --set epochs=30 --set scenario=indoor-v0:motion=random
+
+    coloc train pfnn --out runs/paper --set mode=online --set worlds=1
+
+    coloc train --resume runs/corrector
+
+    coloc evaluate indoor-v0 --agents apf,pfnn:weights=runs/corrector/pfnn.safetensors --out results
+
+    tensorboard --logdir runs
+    """
+    if threads < 1:
+        raise ValueError(f"--threads {threads} is not allowed: at least 1")
+    # MKL's products of matrices would else depend, in their last digits, on where in memory they
+    # lie, and so would the weights. It has to be said before MKL is first used.
+    os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
+    import torch
+
+    torch.set_num_threads(threads)
+    from coloc_env.options import parse
+    from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
+    from training.learning import nnhpff as _nnhpff  # noqa: F401
+    from training.learning import pfnn as _pfnn  # noqa: F401
+    from training.learning import run as runs
+    from training.learning import sb3_ppo as _sb3_ppo  # noqa: F401
+    from training.learning import stdcl as _stdcl  # noqa: F401
+    from training.learning import trust as _trust  # noqa: F401
+
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer it makes
+    if resume is not None:
+        if name is not None or out is not None or settings:
+            raise ValueError("--resume goes alone: a run continues as it was started")
+        with progress() as tell:
+            weights = runs.resume(resume, tell)
+    elif name is None:
+        show(["training", ""], [[k, summary(v)] for k, v in sorted(runs.TRAININGS.items())])
+        typer.echo("coloc train TRAINING lists its options.")
+        return
+    elif out is None:
+        if settings:
+            raise ValueError("--out DIR is needed: the run's folder")
+        explain(name, runs.options_of(name), "option", runs.TRAININGS[name])
+        return
+    else:
+        known = runs.options_of(name)
+        chosen = dict(parse(name, text, known) for text in settings or ())
+        with progress() as tell:
+            weights = runs.start(name, chosen, out, tell)
+    typer.echo(f"weights written to {weights}")

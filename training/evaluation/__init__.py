@@ -1,0 +1,1 @@
+"""Evaluation: the rollout, the run record, figures of merit, tables and files."""

@@ -1,0 +1,166 @@
+"""Evaluation: every agent meets the same worlds, batched over runs, and nothing is ever dropped."""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+
+import agents as _agents  # noqa: F401  (registers the localizers)
+from agents.localizer import Localizer, make
+from coloc_env.bounds import Bound, posterior_bound
+from coloc_env.scenario import Scenario
+from coloc_env.world import World
+from training.evaluation.results import AgentResult, Results
+from training.evaluation.rollout import NUMERICAL, Tape, play
+
+Progress = Callable[[str, int, int], None]
+
+_FAST = 2**25  # bytes of a batch's beliefs and what is made of them in a step: more fits no cache
+_WORKING_SET = 20  # bytes in use at the height of a step per byte of belief
+_TIMED, _WARM_UP = 50, 5  # steps
+
+
+def evaluate(
+    scenario: Scenario,
+    agents: Sequence[str],
+    runs: int = 20,
+    seed: int = 0,
+    progress: Progress | None = None,
+    *,
+    bound: bool = True,
+    chunk: int | None = None,
+) -> Results:
+    """Run agents (names with options, ``"ekf:robust=huber"``) on the worlds of seeds ``seed`` …
+    ``seed + runs − 1``.
+
+    ``progress(what, done, total)`` is called as work is done. ``bound``: compute the posterior
+    bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
+    are fast); no result depends on it, a localizer's own rounding aside.
+
+    A run in which an agent says NaN or infinity, or raises a numerical error, goes on with the last
+    finite estimates (the prior before the first) and counts as diverged.
+    """
+    _check(agents, runs, seed, chunk)
+    team = {name: make(name, scenario) for name in agents}
+    tell = progress or (lambda what, done, total: None)
+    known = _bound(scenario, runs, seed, tell) if bound else None
+    results: dict[str, AgentResult] = {}
+    tape = None
+    for name, localizer in team.items():
+        tape = _runs(name, localizer, scenario, runs, seed, chunk, tell)
+        results[name] = AgentResult(
+            offset=tape.offset.numpy(),
+            error=tape.error.numpy(),
+            nees=tape.nees.numpy(),
+            broken=tape.broken.numpy(),
+            raised=len(tape.raised),
+            message=tape.raised[0] if tape.raised else None,
+            series={key: value.numpy() for key, value in tape.series.items()},
+            ms_per_step=ms_per_step(localizer, scenario, seed),
+        )
+    assert tape is not None
+    return Results(
+        scenario=scenario,
+        seed=seed,
+        truth=tape.truth.numpy(),
+        attitude=tape.attitude[0].numpy(),
+        scored=tape.scored.numpy(),
+        bound=known,
+        agents=results,
+    )
+
+
+def split_agents(text: str) -> list[str]:
+    """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
+    option before (``apf:bounds=100,800``)."""
+    names: list[str] = []
+    for piece in text.split(","):
+        if names and piece[:1] in set("0123456789+-."):
+            names[-1] += f",{piece}"
+        elif piece.strip():
+            names.append(piece.strip())
+    return names
+
+
+def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> None:
+    if not agents:
+        raise ValueError("no agents: at least one is needed")
+    twice = next((name for i, name in enumerate(agents) if name in agents[:i]), None)
+    if twice is not None:
+        raise ValueError(f"agent {twice!r} is named twice")
+    if runs < 1:
+        raise ValueError(f"runs={runs} is not allowed: at least 1")
+    if not 0 <= seed < 2**62:
+        raise ValueError(f"seed={seed} is not allowed: a whole number from 0 to 2^62")
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk={chunk} is not allowed: at least 1")
+
+
+def _bound(scenario: Scenario, runs: int, seed: int, tell: Progress) -> Bound | None:
+    """The posterior bound over the same worlds; None for a scenario that it does not cover."""
+    tell("bound", 0, 1)
+    try:
+        known = posterior_bound(scenario, runs=runs, seed=seed)
+    except (ValueError, NotImplementedError, torch.linalg.LinAlgError):
+        known = None
+    tell("bound", 1, 1)
+    return known
+
+
+def _runs(
+    name: str,
+    localizer: Localizer,
+    scenario: Scenario,
+    runs: int,
+    seed: int,
+    chunk: int | None,
+    tell: Progress,
+) -> Tape:
+    """All runs of one agent, as many at once as are fast together."""
+    at_once = chunk or _runs_at_once(localizer, scenario)
+    done, total = 0, runs * scenario.horizon
+
+    def tick(steps: int) -> None:
+        nonlocal done
+        done += steps
+        tell(name, done, total)
+
+    seeds = torch.arange(seed, seed + runs)
+    return Tape.cat([play(localizer, scenario, part, tick) for part in seeds.split(at_once)])
+
+
+# ------------------------------------------------------------------ cost
+
+
+def _runs_at_once(localizer: Localizer, scenario: Scenario) -> int:
+    """How many runs are fastest together, from the size of one run's belief."""
+    try:
+        size = localizer.reset(World(scenario, window=1).reset(0)).bytes()
+    except NUMERICAL:
+        return 1
+    return max(1, _FAST // (_WORKING_SET * max(1, size)))
+
+
+@torch.no_grad()
+def ms_per_step(localizer: Localizer, scenario: Scenario, seed: int) -> float | None:
+    """Median time in ms of the whole team's step, one world, one thread; None if it raises."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    world = World(scenario)
+    times: list[float] = []
+    try:
+        while len(times) < _WARM_UP + _TIMED:
+            observation = world.reset(seed)
+            belief = localizer.reset(observation)
+            for _ in range(min(scenario.horizon, _WARM_UP + _TIMED - len(times))):
+                start = time.perf_counter()
+                belief, estimate = localizer.step(belief, observation)
+                times.append(time.perf_counter() - start)
+                world.advance(estimate.action())
+                observation = world.observation()
+    except NUMERICAL:
+        return None
+    finally:
+        torch.set_num_threads(threads)
+    return 1e3 * statistics.median(times[_WARM_UP:])

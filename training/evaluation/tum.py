@@ -1,0 +1,57 @@
+"""Trajectories as TUM files, which evaluation tools such as evo read.
+
+One line a pose: ``timestamp tx ty tz qx qy qz qw``, in seconds and metres, body to world. In two
+dimensions z is 0 and the heading turns about it; an attitude that is not known is the identity.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from training.evaluation.metrics import Floats
+from training.evaluation.results import Results
+
+
+def write_tum(results: Results, folder: Path) -> None:
+    """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only."""
+    time = np.arange(results.scenario.horizon) * results.dt
+    attitude = quaternions(results.attitude)
+    identity = np.broadcast_to((0.0, 0.0, 0.0, 1.0), attitude.shape)
+    tracks = {"groundtruth": (results.truth[0], attitude)}
+    for name, label in zip(results.agents, folder_names(list(results.agents)), strict=True):
+        tracks[label] = (results.truth[0] + results.agents[name].offset[0], identity)
+    for label, (position, turned) in tracks.items():
+        (folder / label).mkdir(parents=True)
+        for i, uav in enumerate(results.scenario.agents):
+            now = results.scored[0, :, i]
+            text = tum_text(time[now], position[now, i], turned[now, i])
+            (folder / label / f"{uav}.txt").write_text(text, encoding="ascii")
+
+
+def tum_text(time: Floats, position: Floats, quaternion: Floats) -> str:
+    """Lines for times [K] s, positions [K, d] m and quaternions [K, 4] xyzw."""
+    flat = np.zeros((len(time), 3 - position.shape[1]))
+    table = np.concatenate((time[:, None], position, flat, quaternion), 1)
+    return "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in table.tolist())
+
+
+def quaternions(attitude: Floats) -> Floats:
+    """Attitudes [..., a] (quaternion wxyz, or heading in rad) as quaternions [..., 4] xyzw."""
+    if attitude.shape[-1] == 4:
+        return np.roll(attitude, -1, -1)
+    half = 0.5 * attitude[..., 0]
+    zero = np.zeros_like(half)
+    return np.stack((zero, zero, np.sin(half), np.cos(half)), -1)
+
+
+def folder_names(agents: list[str]) -> list[str]:
+    """Agents' names fit for folders on any system, no two alike: ``ekf:robust=huber`` becomes
+    ``ekf-robust=huber``."""
+    names: list[str] = []
+    for agent in agents:
+        name = re.sub(r"[^\w.=+,-]", "_", agent.replace(":", "-"))
+        while name in ("groundtruth", *names):
+            name += "_"
+        names.append(name)
+    return names

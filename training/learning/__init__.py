@@ -1,0 +1,1 @@
+"""Training: run folders, collectors, and one file for each thing that learns."""

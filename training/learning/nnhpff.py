@@ -1,0 +1,201 @@
+"""Training of the NN-HPFF paper's failure detector on what a filter's estimates look like."""
+
+from collections.abc import Mapping
+from functools import partial
+from itertools import product
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Float32
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from agents import make
+from agents.models.measurements import AnchorRanges
+from agents.models.process import make_process
+from agents.particle.failure import FailureDetector, evidence, network_features
+from agents.policies.adapters import LocalizerPolicy
+from agents.weights import untrained
+from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.observation import Observation, all_leaves
+from coloc_env.scenario import Scenario
+from coloc_env.sensors import AnchorRanging
+from training.evaluation.rollout import play
+from training.learning.collectors import Flights, fly, world_seed
+from training.learning.fleets import SideBySide
+from training.learning.offline import offline_trainer
+from training.learning.run import Progress, Training, at_least, positive, register, scenario_of
+
+FAILED = 0.5  # m: an estimate farther off has failed
+# Low, medium and high: the team's beliefs of the acceleration (m²/s⁴) and of ranges (m²), and the
+# number of particles. Lowest and highest are those of the cases 1 to 3.
+_Q, _R, _PARTICLES = (0.0036, 0.06, 1.0), (0.0016, 0.04, 0.36), (500, 2000, 5000)
+VARIANTS = "/".join(f"q={q:g}:r_believed={r:g}" for q, r in product(_Q, _R))
+MAINS = "/".join(f"pf:particles={count}" for count in _PARTICLES)
+
+
+class DetectorLoss(LossModule):
+    """Mean cross-entropy of ``failed`` [P] given ``features`` [P, 5]."""
+
+    in_keys = ["features", "failed"]  # noqa: RUF012
+    out_keys = ["loss_detector"]  # noqa: RUF012
+
+    def __init__(self, detector: FailureDetector) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        logits = self.detector(tensordict["features"])
+        loss = torch.nn.functional.cross_entropy(logits, tensordict["failed"].long())
+        return TensorDict({"loss_detector": loss})
+
+
+class Samples:
+    """What a flight writes down, as a ``LocalizerPolicy``'s ``record``: ``features`` [B, N, 5] of
+    the estimate, whether it has ``failed``, its ``error`` (m) and whether that is ``scored``
+    [B, N]."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        sensor = scenario.believed.sensor(AnchorRanging)
+        if sensor is None or sensor.tags:
+            raise ValueError(f"nnhpff: {scenario.name} has no anchors, or lever arms to them")
+        self.model, self.process = AnchorRanges(sensor), make_process(scenario.believed)
+        self.leaves, self.n_uavs = tuple(all_leaves(scenario)), scenario.arena.n_uavs
+
+    def __call__(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        d, told = self.process.dim, tensordict["uav", "observation"]
+        state = tensordict["state"].unflatten(-1, (self.n_uavs, -1))
+        position = tensordict["uav", "action"][..., :d]
+        seen = evidence(
+            self.model, self.process, position, Observation({k: told[k] for k in self.leaves})
+        )
+        error = (position - state[..., :d]).norm(dim=-1)
+        return {
+            "features": network_features(seen),
+            "failed": error > FAILED,
+            "error": error,
+            "scored": (state[..., -1] > 0) & (seen.count > 0),
+        }
+
+
+def samples_of(batch: TensorDictBase) -> TensorDict:
+    """A flight's samples [P], whichever world, step and UAV they are of."""
+    train = batch["train"]
+    entries = {key: train[key].flatten(0, 2) for key in ("features", "failed", "error")}
+    rows = TensorDict(entries, entries["failed"].shape)[train["scored"].flatten()]
+    if not len(rows):
+        raise ValueError("nnhpff: no step had truth and distances to anchors to learn from")
+    return rows
+
+
+def _anchors(scenario: Scenario) -> int:
+    """How many anchors the team believes in."""
+    sensor = scenario.believed.sensor(AnchorRanging)
+    return 0 if sensor is None else len(sensor.anchors)
+
+
+@register
+def nnhpff(
+    *,
+    scenario: str = "wsn-v0",
+    variants: str = VARIANTS,
+    mains: str = MAINS,
+    worlds: int = 2,
+    epochs: int = 20,
+    passes: int = 4,
+    minibatch: int = 1024,
+    learning_rate: float = 0.01,
+    seed: int = 0,
+    score_runs: int = 20,
+) -> Training:
+    """The NN-HPFF paper's failure detector (5–10–5–2), from filters that run into trouble.
+
+    In each of ``epochs`` epochs every filter of ``mains`` flies ``worlds`` new worlds of the
+    ``scenario`` in every one of ``variants`` (overrides; both lists are separated by slashes). An
+    estimate more than 0.5 m off has failed. The defaults are the paper's 27 scenarios: low, medium
+    and high process noise, range noise and number of particles. ``score_runs``: held-out worlds in
+    which pf, hpff and nnhpff are compared at the end.
+    """
+    at_least("nnhpff", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
+    at_least("nnhpff", 0, score_runs=score_runs, seed=seed)
+    positive("nnhpff", learning_rate=learning_rate)
+    scenes = [scenario_of(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
+    kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenes}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"nnhpff: variants={variants!r} must have one horizon, one number of UAVs and one of "
+            "anchors"
+        )
+    crew = [
+        (LocalizerPolicy(make(main, scene), scene, record=Samples(scene)), scene)
+        for scene in scenes
+        for main in mains.split("/")
+    ]
+    detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed), kinds
+
+    def launch(epoch: int) -> SideBySide:
+        first = world_seed(seed, epoch, worlds * len(crew))
+        flying = []
+        for i, (policy, scene) in enumerate(crew):
+            env = CoLocEnv(scene, worlds, seed=first + i * worlds)
+            flying.append(fly(env, policy, steps, compact_obs=True))
+        return SideBySide(flying)
+
+    flights = Flights(launch, epochs)
+    loss = DetectorLoss(detector)
+    trainer = offline_trainer(
+        flights,
+        loss,
+        samples_of,
+        partial(_figures, loss),
+        learning_rate=learning_rate,
+        most=worlds * len(crew) * steps * n_uavs,
+        minibatch=minibatch,
+        passes=passes,
+        seed=seed,
+    )
+    return Training(
+        module=detector,
+        flights=flights,
+        trainer=trainer,
+        score=partial(score, detector, scenario, score_runs),
+    )
+
+
+def _figures(loss: DetectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
+    """Cross-entropy, that of always saying how many fail, that share, and how often it is right."""
+    failed: Bool[Tensor, "P"] = rows["failed"]
+    share = failed.double().mean()
+    logits: Float32[Tensor, "P 2"] = loss.detector(rows["features"])
+    right: Float[Tensor, ""] = ((logits[:, 1] > logits[:, 0]) == failed).double().mean()
+    constant = -torch.special.xlogy(share, share) - torch.special.xlogy(1 - share, 1 - share)
+    return {
+        "held_out_loss": loss(rows)["loss_detector"],
+        "constant_loss": constant,
+        "failed_share": share,
+        "accuracy": right,
+    }
+
+
+def score(detector: FailureDetector, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
+    """Mean error (m) and resets a run of pf, hpff and nnhpff in the worlds of seeds 0 … runs − 1 of
+    the three cases."""
+    found: dict[str, Any] = {}
+    if runs == 0 or base.split(":")[0] != "wsn-v0":
+        return found
+    for case in (1, 2, 3):
+        scene = scenario_of(f"{base}:case={case}")
+        each: dict[str, float] = {}
+        for name in ("pf", "hpff", "nnhpff"):
+            options = {"weights": "none"} if name == "nnhpff" else {}
+            one: Any = make(name, scene, **options)
+            if name == "nnhpff":
+                one.learn(detector)
+            tape = play(one, scene, torch.arange(runs), lambda steps: None)
+            each[f"{name}_mean"] = float(tape.error.mean())
+            if "resets_per_run" in tape.series:
+                each[f"{name}_resets"] = float(tape.series["resets_per_run"].sum(1).mean())
+        found[f"case {case}"] = each
+        tell("scoring", case, 3)
+    return {"runs": runs, "seeds": [0, runs - 1], **found}

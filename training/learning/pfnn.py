@@ -1,0 +1,238 @@
+"""Training of the PF-NN paper's weight corrector (equations 11–16)."""
+
+from collections.abc import Mapping
+from functools import partial
+from itertools import cycle
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+from torchrl.trainers import Trainer
+
+from agents import make
+from agents.particle import particle_count
+from agents.particle.cloud import select
+from agents.particle.corrector import motion_features
+from agents.policies.adapters import LocalizerPolicy
+from coloc_env import noise
+from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.scenario import Scenario
+from training.evaluation import metrics
+from training.evaluation.rollout import play
+from training.learning.collectors import Flight, Flights, fly, world_seed
+from training.learning.offline import offline_trainer
+from training.learning.run import (
+    Progress,
+    Training,
+    at_least,
+    make_trainer,
+    positive,
+    register,
+    scenario_of,
+)
+
+EVERY = 10  # steps between trainings (section 2.3)
+PARTICLES = 50  # of each UAV that one training looks at (section 3.3.2)
+LEARNING_RATE = 0.01
+
+
+class CorrectorLoss(LossModule):
+    """Equation 16: L = mean (y − t)² over particles.
+
+    Reads ``features`` [*w, P, 6], ``target`` and ``mask`` [*w, P] (False: a particle that does not
+    count); leading dimensions are networks of their own, whose losses add up.
+    """
+
+    in_keys = ["features", "target", "mask"]  # noqa: RUF012
+    out_keys = ["loss_corrector"]  # noqa: RUF012
+
+    def __init__(self, corrector: torch.nn.Module) -> None:
+        super().__init__()
+        self.corrector = corrector
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        return TensorDict({"loss_corrector": self.error(tensordict).sum()})
+
+    def error(self, tensordict: TensorDictBase) -> Float[Tensor, "*w"]:
+        """Each network's own loss."""
+        y, t = self.corrector(tensordict["features"]), tensordict["target"]
+        return masked_mean((y - t) ** 2, tensordict["mask"])
+
+
+def masked_mean(x: Float[Tensor, "*w P"], mask: Bool[Tensor, "*w P"]) -> Float[Tensor, "*w"]:
+    """Mean over the last dimension where ``mask`` says so; 0 where it never does."""
+    return (x * mask).sum(-1) / mask.sum(-1).clamp_min(1)
+
+
+class Samples:
+    """What the flying filter writes down for training, as a ``LocalizerPolicy``'s ``record``.
+
+    Of ``size`` random particles of each UAV: ``features`` [B, N, P, 6] (equation 11), ``target``
+    [B, N, P] and ``mask``; and of the filter itself ``error`` (m) and ``count`` [B, N].
+    """
+
+    def __init__(self, scenario: Scenario, size: int = PARTICLES) -> None:
+        self.dim, self.n_uavs, self.size = scenario.arena.dim, scenario.arena.n_uavs, size
+
+    def __call__(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        d = self.dim
+        state = tensordict["state"].unflatten(-1, (self.n_uavs, -1))
+        truth, scored = state[..., :d], state[..., -1:] > 0
+        m = after.particles.shape[-2]
+        alive = particle_count.alive(after.count, m)
+        draws = noise.uniform(noise.fold(after.key, after.step), "train.particles", m)
+        chosen = draws.masked_fill(~alive, 2.0).topk(self.size, -1, largest=False).indices
+        particles = select(after.particles, chosen)
+        distance = (particles[..., :d] - truth.unsqueeze(-2)).norm(dim=-1)
+        return {
+            "features": motion_features(particles, before.last, d),
+            "target": torch.exp(-distance),
+            "mask": alive.gather(-1, chosen) & scored,
+            "error": (tensordict["uav", "action"][..., :d] - truth).norm(dim=-1),
+            "scored": scored[..., 0],
+            "count": after.count,
+        }
+
+
+def samples_of(batch: TensorDictBase) -> TensorDict:
+    """The particles of every EVERY-th step of a batch [B, T], by world and UAV: [B, N, P]."""
+    train = batch["train"][:, EVERY - 1 :: EVERY]
+    keys = ("features", "target", "mask")
+    entries = {key: train[key].movedim(1, 2).flatten(2, 3) for key in keys}
+    return TensorDict(entries, entries["mask"].shape)
+
+
+class InTurn:
+    """The samples of one UAV after the other, from the same batch: Algorithm 1 trains in its loop
+    over UAVs, a step of gradient descent each."""
+
+    def __init__(self, n_uavs: int) -> None:
+        self.turn = cycle(range(n_uavs))
+
+    def __call__(self, batch: TensorDictBase) -> TensorDict:
+        """[B, P] of a batch [B, T]."""
+        return samples_of(batch)[:, next(self.turn)]
+
+
+@register
+def pfnn(
+    *,
+    mode: Literal["offline", "online"] = "offline",
+    scenario: str = "indoor-v0",
+    worlds: int = 8,
+    epochs: int = 20,
+    passes: int = 4,
+    minibatch: int = 1024,
+    learning_rate: float = LEARNING_RATE,
+    seed: int = 0,
+    score_runs: int = 10,
+) -> Training:
+    """The PF-NN paper's weight corrector, from the simulator's truth (equations 11 to 16).
+
+    Every epoch the filter flies new worlds with its newest weights. With ``mode=offline`` it learns
+    after the flight, from a replay buffer of the flight's particles, in several passes.
+    ``mode=online`` is the paper's way: every 10 steps a step of gradient descent on each UAV's
+    particles in turn, in flight, which the filter uses at once (no ``passes``, no ``minibatch``).
+
+    The ``scenario`` takes overrides: ``indoor-v0:motion=random:horizon=300``. At the end ``apf``
+    and ``pfnn`` are compared in ``score_runs`` held-out worlds of it.
+    """
+    at_least("pfnn", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
+    at_least("pfnn", 0, score_runs=score_runs, seed=seed)
+    positive("pfnn", learning_rate=learning_rate)
+    scene = scenario_of(scenario)
+    if scene.horizon < EVERY:
+        raise ValueError(f"pfnn: a horizon of {scene.horizon} steps is too short: {EVERY} at least")
+    localizer: Any = make("pfnn", scene, weights="none", seed=seed)
+    loss = CorrectorLoss(localizer.corrector)
+    steps = EVERY if mode == "online" else scene.horizon // EVERY * EVERY
+
+    def launch(epoch: int) -> Flight:
+        policy = LocalizerPolicy(localizer, scene, record=Samples(scene))
+        env = CoLocEnv(scene, worlds, seed=world_seed(seed, epoch, worlds))
+        return fly(env, policy, steps, compact_obs=True)
+
+    flights = Flights(launch, epochs)
+    if mode == "online":
+        trainer = _online(flights, loss, learning_rate, scene.arena.n_uavs)
+    else:
+        most = worlds * scene.arena.n_uavs * PARTICLES * (steps // EVERY)
+        trainer = offline_trainer(
+            flights,
+            loss,
+            _samples,
+            partial(_held_out, loss),
+            learning_rate=learning_rate,
+            most=most,
+            minibatch=minibatch,
+            passes=passes,
+            seed=seed,
+        )
+    trainer.register_op("pre_steps_log", _figures)
+    return Training(
+        module=localizer.corrector,
+        flights=flights,
+        trainer=trainer,
+        score=partial(score, localizer, scene, score_runs),
+    )
+
+
+def _online(flights: Flights, loss: CorrectorLoss, learning_rate: float, n_uavs: int) -> Trainer:
+    """Plain gradient descent on each UAV's particles in turn, once a batch (Algorithm 1)."""
+    optimizer = torch.optim.SGD(loss.parameters(), learning_rate)
+    trainer, in_turn = make_trainer(flights, loss, optimizer, n_uavs), InTurn(n_uavs)
+    trainer.register_op("process_optim_batch", lambda batch: in_turn(batch).flatten())
+    return trainer
+
+
+def _samples(batch: TensorDictBase) -> TensorDict:
+    """All particles of a flight that count."""
+    rows = samples_of(batch).flatten()
+    return rows[rows["mask"]]
+
+
+def _held_out(loss: CorrectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
+    """The loss, and that of the best constant."""
+    return {
+        "held_out_loss": loss(rows)["loss_corrector"],
+        "constant_loss": rows["target"].var(unbiased=False),
+    }
+
+
+def _figures(batch: TensorDictBase) -> dict[str, float]:
+    """RMSE (m) and mean number of particles of a batch."""
+    train = batch["train"]
+    squared = masked_mean(train["error"].flatten() ** 2, train["scored"].flatten())
+    return {"rmse": float(squared.sqrt()), "particles": float(train["count"].double().mean())}
+
+
+def score(localizer: Any, scenario: Scenario, runs: int, tell: Progress) -> Mapping[str, Any]:
+    """RMSE (m) of ``apf`` and of the trained filter in the worlds of seeds 0 … runs − 1."""
+    if runs == 0:
+        return {}
+    plain, tapes = make("apf", scenario, seed=localizer.seed), {}
+    for name, one in (("apf", plain), ("pfnn", localizer)):
+        done = 0
+
+        def tick(steps: int, name: str = name) -> None:
+            nonlocal done
+            done += steps
+            tell(f"scoring {name}", done, runs * scenario.horizon)
+
+        tapes[name] = play(one, scenario, torch.arange(runs), tick)
+    per_run = {
+        name: metrics.rmse_per_run(tape.error.numpy(), tape.scored.numpy())
+        for name, tape in tapes.items()
+    }
+    difference = metrics.paired_difference(per_run["pfnn"], per_run["apf"])
+    return {
+        "runs": runs,
+        "seeds": [0, runs - 1],
+        **{f"{name}_rmse": float(np.sqrt(np.mean(x**2))) for name, x in per_run.items()},
+        "difference": difference.mean,
+        "difference_95": [difference.low, difference.high] if runs > 1 else None,
+    }

@@ -1,0 +1,191 @@
+"""Training of the trust networks, by truncated backpropagation through a differentiable EKF."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from agents import make
+from agents.kalman.ekf import CooperativeEkf, GaussianBelief
+from agents.policies.adapters import LocalizerPolicy
+from agents.trust import TrustNetwork
+from agents.weights import untrained
+from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.observation import Observation, all_leaves
+from coloc_env.scenario import Scenario
+from training.evaluation import metrics
+from training.evaluation.rollout import play
+from training.learning.collectors import Flights, fly, world_seed
+from training.learning.fleets import TakingTurns
+from training.learning.run import (
+    Progress,
+    Training,
+    at_least,
+    make_trainer,
+    positive,
+    register,
+    scenario_of,
+)
+
+# What the networks meet: each alone, all at once, and nothing at all.
+VARIANTS = (
+    "",
+    "motion=random",
+    "prior=uniform",
+    "nlos=0.3",
+    "nlos=0.15:nlos_bias=0.5:motion=random",
+    "nlos=0.3:range_only=5,25:horizon=300",
+    "false_matches=0.1",
+    "nlos=0.3:false_matches=0.1:landmark_dropout=0.5:motion=random",
+    "landmarks=5:horizon=300",
+    "landmarks=5:nlos=0.3:horizon=300",
+    "landmarks=5:nlos=0.3:motion=random:horizon=300",
+    "landmarks=5:nlos=0.3:false_matches=0.1:horizon=300",
+    "landmarks=5:nlos=0.5:false_matches=0.2:motion=random",
+    "prior=uniform:landmarks=5:nlos=0.3:false_matches=0.1:landmark_dropout=0.5:horizon=200",
+    "prior=uniform:landmarks=5:nlos=0.3:false_matches=0.1:landmark_dropout=0.5:motion=random",
+)
+SCORED = ("", "nlos=0.3", "false_matches=0.1", "landmarks=5:nlos=0.3:false_matches=0.1")
+_SOFT = 20.0  # Mahalanobis² beyond which a lost UAV's loss grows like its logarithm only
+
+
+def negative_log_likelihood(
+    offset: Float[Tensor, "*s d"], covariance: Float[Tensor, "*s d d"]
+) -> Float[Tensor, "*s"]:
+    """½ (eᵀ P⁻¹ e + log det P) of a position's error, growing slowly where a UAV is lost."""
+    root = torch.linalg.cholesky(covariance)
+    scaled = torch.linalg.solve_triangular(root, offset.unsqueeze(-1), upper=False)[..., 0]
+    squared = scaled.square().sum(-1)
+    far = _SOFT * (1 + (squared.clamp_min(_SOFT) / _SOFT).log())
+    squared = torch.where(squared > _SOFT, far, squared)
+    return 0.5 * squared + root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+class TrustLoss(LossModule):
+    """Mean negative log-likelihood of the positions over a batch's steps.
+
+    The EKF is run again over the batch [B, T], from the belief that its first step was flown with
+    and on the observations that were made, this time with gradients: truncated backpropagation
+    through time. What neighbours said is taken as it was heard.
+    """
+
+    in_keys = ["uav", "state", "train"]  # noqa: RUF012
+    out_keys = ["loss_trust"]  # noqa: RUF012
+
+    def __init__(
+        self, network: TrustNetwork, filters: Sequence[CooperativeEkf], scenes: Sequence[Scenario]
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.filters, self.scenes = tuple(filters), tuple(scenes)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        train = tensordict["train"]
+        variant = int(train["variant"][0, 0])
+        ekf, scene = self.filters[variant], self.scenes[variant]
+        n, d = scene.arena.n_uavs, scene.arena.dim
+        state = tensordict["state"].unflatten(-1, (n, -1)).double()
+        belief = _belief(train[:, 0])
+        losses = []
+        for t in range(tensordict.shape[1]):
+            seen = tensordict["uav", "observation"][:, t]
+            observation = Observation({name: seen[name] for name in all_leaves(scene)})
+            belief, estimate = ekf.step(belief, observation)
+            offset = estimate.position - state[:, t, :, :d]
+            losses.append(negative_log_likelihood(offset, estimate.covariance))
+        scored = state[..., -1].movedim(1, 0) > 0
+        loss = torch.where(scored, torch.stack(losses), 0.0).sum() / scored.sum()
+        return TensorDict({"loss_trust": loss})
+
+
+def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
+    """The belief that a step starts from, and which scenario it is flown in."""
+    return {
+        "state": before.state,
+        "covariance": before.covariance,
+        "step": before.step,
+        "memory": before.memory,
+        "variant": torch.full(before.batch_size[:1], variant),
+    }
+
+
+def _belief(entries: TensorDictBase) -> GaussianBelief:
+    parts = {name: entries[name] for name in ("state", "covariance", "step", "memory")}
+    return GaussianBelief(**parts, batch_size=parts["step"].shape)
+
+
+@register
+def trust(
+    *,
+    scenario: str = "indoor-v0:horizon=100",
+    worlds: int = 16,
+    epochs: int = 8,
+    steps: int = 10,
+    learning_rate: float = 2e-3,
+    seed: int = 0,
+    score_runs: int = 10,
+) -> Training:
+    """The trust networks of ``ekf_trust`` and ``pfnn_trust``, through a differentiable EKF.
+
+    In each of ``epochs`` epochs ``worlds`` new worlds of every variant of ``scenario`` (clean,
+    NLOS, false matches, few landmarks, uniform prior, combinations) are flown by ``ekf_trust``
+    with its newest weights; every ``steps`` steps the position's negative log-likelihood is
+    backpropagated through them. The learning rate falls linearly to a twentieth.
+    ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
+    """
+    at_least("trust", 1, worlds=worlds, epochs=epochs, steps=steps)
+    at_least("trust", 0, score_runs=score_runs, seed=seed)
+    positive("trust", learning_rate=learning_rate)
+    scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
+    network = untrained(TrustNetwork, seed)
+    filters: list[Any] = [make("ekf_trust", scene, weights="none") for scene in scenes]
+    for one in filters:
+        one.learn(network)
+    loss = TrustLoss(network, filters, scenes)
+    optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
+
+    def launch(epoch: int) -> Any:
+        share = 1 - 0.95 * epoch / max(1, epochs - 1)
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate * share
+        first = world_seed(seed, epoch, worlds * len(scenes))
+        collectors = []
+        for i, (ekf, scene) in enumerate(zip(filters, scenes, strict=True)):
+            env = CoLocEnv(scene, worlds, seed=first + i * worlds)
+            policy = LocalizerPolicy(ekf, scene, record=partial(_record, i))
+            # ("next", "uav", "observation") is the next step's: half the memory.
+            collectors.append(fly(env, policy, steps, compact_obs=True))
+        return TakingTurns(collectors)
+
+    flights = Flights(launch, epochs)
+    trainer = make_trainer(flights, loss, optimizer, clip_norm=1.0)
+    return Training(
+        module=network,
+        flights=flights,
+        trainer=trainer,
+        score=partial(score, network, scenario.split(":")[0], score_runs),
+    )
+
+
+def score(network: TrustNetwork, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
+    """RMSE (m) of ``ekf_trust`` and of a Huber EKF over 300 steps of the worlds of seeds
+    0 … runs − 1 in some variants."""
+    found: dict[str, Any] = {}
+    if runs == 0:
+        return found
+    for variant in SCORED:
+        scene = scenario_of(f"{base}:horizon=300:{variant}".rstrip(":"))
+        learned: Any = make("ekf_trust", scene, weights="none")
+        learned.learn(network)
+        each = {}
+        for name, one in (("ekf_trust", learned), ("ekf_huber", make("ekf:robust=huber", scene))):
+            tape = play(one, scene, torch.arange(runs), lambda steps: None)
+            each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+        found[variant or "default"] = each
+        tell("scoring", len(found), len(SCORED))
+    return {"runs": runs, "seeds": [0, runs - 1], "steps": 300, "rmse": found}
