@@ -64,7 +64,7 @@ SWARM_OPTIONS = [
     "stdcl:feedback=paper",
 ]
 RENAMED: dict[str, str] = {"pfnn_trust": "pf_trust"}  # agents, before → after
-MEANT: dict[str, str] = {}  # "scenario agent": why its figures differ
+MEANT = "would be ignored"  # refused now: a localizer no longer ignores what a team measures
 UNTOUCHED = ("ms_per_step",)
 
 
@@ -93,7 +93,10 @@ def one(case: tuple[str, list[str], str]) -> tuple[str, Any]:
     warnings.simplefilter("ignore")
     from typer.testing import CliRunner
 
-    from training.cli import app
+    try:
+        from training.cli.command import app
+    except ModuleNotFoundError:  # before the house was redrawn
+        from training.cli import app
 
     scenario, settings, agent = case
     key = " ".join((scenario, *settings, agent))
@@ -136,16 +139,15 @@ def compare(before: Path, after: Path) -> int:
     """Print every difference that is not meant; the number of them."""
     old = json.loads(before.read_text())
     new = json.loads(after.read_text())
-    wrong = 0
+    wrong = meant = 0
     for key, figures in old.items():
         *where, agent = key.split(" ")
         renamed = " ".join((*where, RENAMED.get(agent, agent)))
         other = new.get(renamed)
         if figures == other or (isinstance(figures, str) and isinstance(other, str)):
             continue
-        why = MEANT.get(f"{where[0]} {agent}") or MEANT.get(f"* {agent}") or MEANT.get(where[0])
-        if why:
-            print(f"meant: {renamed}: {why}")
+        if isinstance(other, str) and MEANT in other:
+            meant += 1
             continue
         wrong += 1
         print(f"DIFFERS: {renamed}")
@@ -158,7 +160,7 @@ def compare(before: Path, after: Path) -> int:
                 f"    {figures if isinstance(figures, str) else 'figures'} -> "
                 f"{other if isinstance(other, (str, type(None))) else 'figures'}"
             )
-    print(f"{len(old)} cases compared, {wrong} differ")
+    print(f"{len(old)} cases compared: {meant} refused now on purpose, {wrong} differ")
     return wrong
 
 

@@ -1,24 +1,23 @@
-"""Localizers and policies; importing this package registers every localizer."""
+"""Localizers and policies: what estimates and decides, by name.
 
-from agents.factor_graph import pose_graph as _pose_graph  # noqa: F401
-from agents.kalman import ekf as _ekf  # noqa: F401
-from agents.kalman import ekf_joint as _ekf_joint  # noqa: F401
-from agents.kalman import emvf as _emvf  # noqa: F401
-from agents.localizer import LOCALIZERS, Estimate, Localizer, make, options_of, register
-from agents.particle import hybrid as _hybrid  # noqa: F401
-from agents.particle import pf as _pf  # noqa: F401
-from agents.particle import pf_joint as _pf_joint  # noqa: F401
-from agents.particle import pfnn as _pfnn  # noqa: F401
-from agents.policies import learned as _learned_policy  # noqa: F401
-from agents.stdcl import stdcl as _stdcl  # noqa: F401
-from agents.stein import cspf as _cspf  # noqa: F401
-from agents.stein import stein_vi as _stein_vi  # noqa: F401
-from agents.swarm import dwmds as _costa_mds  # noqa: F401
-from agents.swarm import dwmds_st as _dwmds  # noqa: F401
-from agents.swarm import fcmds as _fc_mds  # noqa: F401
-from agents.swarm import map as _team_map  # noqa: F401
-from agents.swarm import mds as _mds  # noqa: F401
-from agents.swarm import vmds as _velocity_mds  # noqa: F401
-from agents.trust import trusting as _trusting  # noqa: F401
+``agents.make("ekf:robust=huber", scenario)`` builds one; ``agents.LOCALIZERS`` lists them, those of
+installed packages included (entry points ``coloc.localizers``).
+"""
 
-__all__ = ["LOCALIZERS", "Estimate", "Localizer", "make", "options_of", "register"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from agents.registry import LOCALIZERS, make
+
+if TYPE_CHECKING:
+    from agents.localizer import Estimate, Localizer
+
+__all__ = ["LOCALIZERS", "Estimate", "Localizer", "make"]
+
+_HOMES = {"Estimate": "agents.localizer", "Localizer": "agents.localizer"}  # they need torch
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -1,18 +1,18 @@
-"""The Localizer protocol, its estimates, and the registry of localizers by name."""
+"""The Localizer protocol and its estimates."""
 
-import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from tensordict import TensorClass
 from torch import Tensor
 
-from coloc_env import options
+from agents.models.measurements import MODELS
+from agents.models.process import drives
 from coloc_env.observation import Observation
-from coloc_env.scenario import Believed, Scenario
+from coloc_env.scenario import Believed
+from coloc_env.sensors import Sensor
 
 
 class Estimate(TensorClass):
@@ -46,6 +46,9 @@ class Localizer(ABC, Generic[Belief]):
 
     name: ClassVar[str]
     centralized: ClassVar[bool] = False
+    serves: ClassVar[tuple[type[Sensor], ...] | None] = None
+    """Sensors that it makes use of, beside what drives the motion model; None: every sensor that
+    has a measurement model."""
 
     def __init__(self, believed: Believed) -> None:
         self.believed = believed
@@ -60,6 +63,16 @@ class Localizer(ABC, Generic[Belief]):
 
         Pure: neither argument is written to.
         """
+
+    @classmethod
+    def ignores(cls, believed: Believed) -> list[str]:
+        """Sensors of a team whose measurements the localizer would ignore."""
+        served = tuple(MODELS) if cls.serves is None else cls.serves
+        return [
+            type(sensor).__name__
+            for sensor in believed.sensors
+            if sensor.informs and not drives(believed, sensor) and not isinstance(sensor, served)
+        ]
 
     @property
     def exchanges(self) -> bool:
@@ -104,50 +117,3 @@ class Localizer(ABC, Generic[Belief]):
     def diagnostics(self, belief: Belief) -> dict[str, Float[Tensor, "B N"]]:
         """A method's own figures at this step (particles, effective sample size, …)."""
         return {}
-
-
-Factory = Callable[..., Localizer]
-LOCALIZERS: dict[str, Factory] = {}
-_SUITED: dict[str, Factory] = {}
-_L = TypeVar("_L", bound=Factory)
-
-
-def register(name: str, suited: Callable[[Factory], Factory] | None = None) -> Callable[[_L], _L]:
-    """Register a localizer: a callable of ``believed`` and keyword-only options. ``suited`` makes
-    of it one that builds what fits the team."""
-
-    def add(factory: _L) -> _L:
-        LOCALIZERS[name] = factory
-        if suited is not None:
-            _SUITED[name] = suited(factory)
-        return factory
-
-    return add
-
-
-def options_of(name: str) -> dict[str, inspect.Parameter]:
-    """Option names of a localizer with their types and defaults."""
-    options.require_known("agent", [name], sorted(LOCALIZERS))
-    return options.parameters(LOCALIZERS[name])
-
-
-def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
-    """Build a localizer for what the scenario's team believes (or for those beliefs).
-
-    ``name`` may carry options as on the command line (``"ekf:robust=huber"``). Raises ValueError,
-    in one line that names what is allowed, for an unknown name or option.
-    """
-    name, *texts = name.split(":")
-    known = options_of(name)
-    for text in texts:
-        key, value = options.parse(name, text, known)
-        if key in chosen:
-            raise ValueError(f"{name}: {key} is given twice")
-        chosen[key] = value
-    options.check(name, chosen, known)
-    believed = scenario if isinstance(scenario, Believed) else scenario.believed
-    try:
-        return _SUITED.get(name, LOCALIZERS[name])(believed, **chosen)
-    except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error

@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import pettingzoo
 
-from coloc_env.scenario import Scenario
-from coloc_env.scenarios import FAMILIES, make_scenario
+from coloc_env.scenarios import SCENARIOS, make_scenario
 
 if TYPE_CHECKING:
     from coloc_env.envs.per_uav import PerUavEnv
     from coloc_env.envs.pettingzoo import env, parallel_env
     from coloc_env.envs.sb3 import CoLocVecEnv
     from coloc_env.envs.torchrl import CoLocEnv
+    from coloc_env.scenario import Scenario
     from coloc_env.world import World
 
 __all__ = [
+    "SCENARIOS",
     "CoLocEnv",
     "CoLocVecEnv",
     "PerUavEnv",
@@ -34,6 +35,7 @@ _HOMES = {  # loaded when asked for: TorchRL takes a second that PettingZoo's us
     "CoLocEnv": "coloc_env.envs.torchrl",
     "CoLocVecEnv": "coloc_env.envs.sb3",
     "PerUavEnv": "coloc_env.envs.per_uav",
+    "Scenario": "coloc_env.scenario",
     "World": "coloc_env.world",
     "env": "coloc_env.envs.pettingzoo",
     "parallel_env": "coloc_env.envs.pettingzoo",
@@ -47,7 +49,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _register() -> None:
-    for scenario in FAMILIES:
+    for scenario in SCENARIOS:
         for face, maker in (("parallel", "parallel_env"), ("aec", "env")):
             pettingzoo.register(
                 face,

@@ -1,39 +1,169 @@
-"""Keyword options with types: checked when called from Python, parsed when typed on a command line.
+"""Options by keyword: what each may be, checked when called from Python, parsed from a command
+line.
 
-Scenario overrides and agent options are the keyword-only parameters of a function or class; their
-annotations say what fits. Every refusal is one line that names the key and what is allowed.
+Options of a scenario, a localizer or a training are the keyword-only parameters of the function or
+class that makes it; their annotations say what fits. A number says what it measures, and within
+what bounds (``Metres``, ``Share``, ``Annotated[float, Quantity("dB", 0)]``). Options that several
+functions have in common are declared once, in a dataclass that extends ``Group``: a parameter of
+that type stands for all its fields, with the defaults that the function gives. Every refusal is one
+line that names the option and what is allowed.
 """
 
+import dataclasses
 import difflib
 import inspect
+import math
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 _UNFIT = object()
+_MOST = 1e12  # of anything that is measured: beyond, float32 makes no sense of it
 
 
-def parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Keyword-only parameters of a function or class, annotations evaluated; a class that takes
-    ``**options`` passes them on to the class it extends, and so has that one's, too."""
+@dataclass(frozen=True)
+class Quantity:
+    """What a number measures: its ``unit`` and the bounds within which it must lie; ``above``: a
+    bound that it must exceed. Infinity fits only where ``infinite``."""
+
+    unit: str = ""
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+    infinite: bool = False
+
+    def allows(self, value: float) -> bool:
+        """Whether a number lies within the bounds (NaN does not)."""
+        sane = abs(value) <= _MOST or (self.infinite and math.isinf(value))
+        return sane and self.least <= value <= self.most and value > self.above
+
+    def words(self) -> str:
+        """The bounds and the unit, as they follow "a number"."""
+        bounds = ""
+        if self.above > -math.inf:
+            bounds = f" > {self.above:g}"
+        elif self.least > -math.inf and self.most < math.inf:
+            bounds = f" from {self.least:g} to {self.most:g}"
+        elif self.least > -math.inf:
+            bounds = f" ≥ {self.least:g}"
+        return bounds + (f" in {self.unit}" if self.unit else "")
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """The names that a text may be."""
+
+    names: tuple[str, ...]
+
+
+Metres = Annotated[float, Quantity("m", 0.0)]
+PositiveMetres = Annotated[float, Quantity("m", above=0.0)]
+Seconds = Annotated[float, Quantity("s", 0.0)]
+PositiveSeconds = Annotated[float, Quantity("s", above=0.0)]
+Speed = Annotated[float, Quantity("m/s", 0.0)]
+PositiveSpeed = Annotated[float, Quantity("m/s", above=0.0)]
+Acceleration = Annotated[float, Quantity("m/s²", 0.0)]
+AngularRate = Annotated[float, Quantity("rad/s", 0.0)]
+Radians = Annotated[float, Quantity("rad", 0.0)]
+Degrees = Annotated[float, Quantity("°", 0.0)]
+Share = Annotated[float, Quantity("", 0.0, 1.0)]
+Factor = Annotated[float, Quantity("", above=0.0)]
+Count = Annotated[int, Quantity("", 0)]
+PositiveCount = Annotated[int, Quantity("", 1)]
+
+
+class Group:
+    """Base of frozen dataclasses of options that several functions have in common."""
+
+    title: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option: its type, its default (``inspect.Parameter.empty``: it must be given), the title
+    of the group that it belongs to, and the parameter that takes the group (None: the option is a
+    parameter itself)."""
+
+    name: str
+    annotation: Any
+    default: Any
+    group: str = ""
+    parameter: str | None = None
+
+    @property
+    def unit(self) -> str:
+        """Unit of the number, or of the first of several; empty where there is none."""
+        return next((q.unit for q in _quantities(self.annotation) if q.unit), "")
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """All that the option may be, where it is a choice."""
+        for kind in _alternatives(self.annotation):
+            names = _one_of(kind)
+            if names is not None:
+                return names
+        return ()
+
+    @property
+    def words(self) -> str:
+        """What the option may be, in a user's words."""
+        return describe(self.annotation)
+
+
+def of(function: Callable[..., Any]) -> dict[str, Option]:
+    """Options of a function or class, by name: its keyword-only parameters, those of a ``Group``
+    spread out. A class that takes ``**options`` passes them on to the class it extends, and so has
+    that one's, too."""
     own = inspect.signature(function, eval_str=True).parameters
-    named = {k: p for k, p in own.items() if p.kind is p.KEYWORD_ONLY}
+    found: dict[str, Option] = {}
+    for name, parameter in own.items():
+        if parameter.kind is not parameter.KEYWORD_ONLY:
+            continue
+        kind = parameter.annotation
+        if isinstance(kind, type) and issubclass(kind, Group):
+            for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+                default = getattr(parameter.default, field.name)
+                hint = typing.get_type_hints(kind, include_extras=True)[field.name]
+                found[field.name] = Option(field.name, hint, default, kind.title, name)
+        else:
+            found[name] = Option(name, kind, parameter.default)
     if isinstance(function, type) and any(p.kind is p.VAR_KEYWORD for p in own.values()):
-        extended = parameters(function.__mro__[1])
-        return named | {k: p for k, p in extended.items() if k not in named}
-    return named
+        extended = of(function.__mro__[1])
+        return found | {name: one for name, one in extended.items() if name not in found}
+    return found
 
 
-def check(owner: str, options: Mapping[str, Any], known: Mapping[str, inspect.Parameter]) -> None:
-    """Raise ValueError for an unknown option or a value that does not fit its type."""
-    for key, value in options.items():
+def checked(owner: str, chosen: Mapping[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
+    """The chosen values, numpy's scalars as Python's; ValueError for an unknown option or a value
+    that does not fit."""
+    found = {}
+    for key, value in chosen.items():
         _known(owner, key, known)
+        value = _plain(value)
         if not fits(value, known[key].annotation):
-            raise ValueError(_unfit(owner, key, value, known))
+            raise ValueError(_unfit(owner, known[key], value))
+        found[key] = value
+    return found
 
 
-def parse(owner: str, text: str, known: Mapping[str, inspect.Parameter]) -> tuple[str, Any]:
+def grouped(function: Callable[..., Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """The chosen options as keywords of ``function``: what belongs to a group put into that group,
+    whose other options keep the function's defaults."""
+    known, keywords = of(function), dict(chosen)
+    groups: dict[str, dict[str, Any]] = {}
+    for name in chosen:
+        parameter = known[name].parameter
+        if parameter is not None:
+            groups.setdefault(parameter, {})[name] = keywords.pop(name)
+    defaults = inspect.signature(function).parameters
+    for parameter, fields in groups.items():
+        keywords[parameter] = dataclasses.replace(defaults[parameter].default, **fields)
+    return keywords
+
+
+def parse(owner: str, text: str, known: Mapping[str, Option]) -> tuple[str, Any]:
     """``key=value`` from a command line, the value read as the option's type.
 
     Lists of numbers are written ``30,20,5``, time spans ``40:60``, nothing ``none``.
@@ -46,7 +176,7 @@ def parse(owner: str, text: str, known: Mapping[str, inspect.Parameter]) -> tupl
         parsed = _parse(value, kind)
         if parsed is not _UNFIT:
             return key, parsed
-    raise ValueError(_unfit(owner, key, value, known))
+    raise ValueError(_unfit(owner, known[key], value))
 
 
 def require_known(what: str, wanted: Iterable[str] | None, known: Iterable[str]) -> None:
@@ -67,39 +197,39 @@ def unknown(what: str, key: str, known: Iterable[str]) -> str:
 
 def describe(annotation: Any) -> str:
     """A type in a user's words."""
-    words = {
-        int: "a whole number",
-        float: "a number",
-        str: "a name",
-        bool: "true or false",
-        type(None): "none",
-    }
-    parts = []
-    for kind in _alternatives(annotation):
-        inner = typing.get_args(kind)
-        if typing.get_origin(kind) is tuple:
-            size = "" if inner[-1] is Ellipsis else f"{len(inner)} "
-            parts.append(f"{size}numbers separated by ',' or ':'")
-        elif typing.get_origin(kind) is typing.Literal:
-            parts.append("one of " + ", ".join(map(str, inner)))
-        else:
-            parts.append(words.get(kind, getattr(kind, "__name__", str(kind))))
-    return " or ".join(parts)
+    return " or ".join(_describe(kind) for kind in _alternatives(annotation))
 
 
 def fits(value: Any, annotation: Any) -> bool:
-    """Whether a value is of an annotated type (an int fits float; bool fits neither)."""
+    """Whether a value is of an annotated type and within its bounds (an int fits float; bool fits
+    neither)."""
     return any(_fits(value, kind) for kind in _alternatives(annotation))
 
 
-def _known(owner: str, key: str, known: Mapping[str, inspect.Parameter]) -> None:
+def paragraphs(text: str) -> list[str]:
+    """A docstring's paragraphs, one line each, without marks of code; one that is empty if there is
+    no docstring."""
+    plain = inspect.cleandoc(text).replace("``", "")
+    return [" ".join(paragraph.split()) for paragraph in plain.split("\n\n")]
+
+
+# ------------------------------------------------------------------ types
+
+
+def _known(owner: str, key: str, known: Mapping[str, Option]) -> None:
     if key not in known:
         raise ValueError(f"{owner}: {unknown('option', key, known)}")
 
 
-def _unfit(owner: str, key: str, value: Any, known: Mapping[str, inspect.Parameter]) -> str:
-    needed = describe(known[key].annotation)
-    return f"{owner}: {key}={value!r} is not allowed: {needed} is needed"
+def _unfit(owner: str, option: Option, value: Any) -> str:
+    return f"{owner}: {option.name}={value!r} is not allowed: {option.words} is needed"
+
+
+def _plain(value: Any) -> Any:
+    """A value without numpy: its scalars have an ``item``."""
+    if isinstance(value, tuple | list):
+        return type(value)(map(_plain, value))
+    return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -108,39 +238,93 @@ def _alternatives(annotation: Any) -> list[Any]:
     return [annotation]
 
 
+def _bare(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type, and what is annotated to it."""
+    if typing.get_origin(kind) is Annotated:
+        inner, *notes = typing.get_args(kind)
+        return inner, tuple(notes)
+    return kind, ()
+
+
+def _one_of(kind: Any) -> tuple[Any, ...] | None:
+    """The choices of a type; None if it is not a choice."""
+    if typing.get_origin(kind) is typing.Literal:
+        return typing.get_args(kind)
+    return next((note.names for note in _bare(kind)[1] if isinstance(note, OneOf)), None)
+
+
+def _quantities(annotation: Any) -> list[Quantity]:
+    found = []
+    for kind in _alternatives(annotation):
+        bare, notes = _bare(kind)
+        found += [note for note in notes if isinstance(note, Quantity)]
+        if typing.get_origin(bare) is tuple:
+            found += [q for each in typing.get_args(bare) for q in _quantities(each)]
+    return found
+
+
+def _describe(kind: Any) -> str:
+    names = _one_of(kind)
+    if names is not None:
+        return "one of " + ", ".join(map(str, names))
+    bare, notes = _bare(kind)
+    bounds = next((note.words() for note in notes if isinstance(note, Quantity)), "")
+    words = {
+        int: "a whole number",
+        float: "a number",
+        str: "a name",
+        bool: "true or false",
+        type(None): "none",
+    }
+    if typing.get_origin(bare) is tuple:
+        inner = typing.get_args(bare)
+        size = "" if inner[-1] is Ellipsis else f"{len(inner)} "
+        units = dict.fromkeys(q.words() for each in inner for q in _quantities(each))
+        return f"{size}numbers{','.join(units)} separated by ',' or ':'"
+    return words.get(bare, getattr(bare, "__name__", str(bare))) + bounds
+
+
+def _each(inner: Sequence[Any], count: int) -> list[Any]:
+    """The types of a tuple's ``count`` entries."""
+    return [inner[0]] * count if inner[-1] is Ellipsis else list(inner)
+
+
 def _fits(value: Any, kind: Any) -> bool:
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin is tuple:
+    bare, notes = _bare(kind)
+    names = _one_of(kind)
+    if names is not None:
+        return any(type(value) is type(each) and value == each for each in names)
+    if typing.get_origin(bare) is tuple:
         if not isinstance(value, (tuple, list)):
             return False
-        kinds = [inner[0]] * len(value) if inner[-1] is Ellipsis else list(inner)
+        kinds = _each(typing.get_args(bare), len(value))
         return len(kinds) == len(value) and all(map(fits, value, kinds))
-    if origin is typing.Literal:
-        return any(type(value) is type(each) and value == each for each in inner)
-    if kind is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
-    if kind is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, kind)
+    bounds = [note for note in notes if isinstance(note, Quantity)]
+    if bare in (float, int):
+        numbers = (int, float) if bare is float else int
+        right = isinstance(value, numbers) and not isinstance(value, bool) and value == value
+        return right and all(bound.allows(value) for bound in bounds)
+    return isinstance(value, bare)
 
 
 def _parse(text: str, kind: Any) -> Any:
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if kind is type(None):
+    bare, _ = _bare(kind)
+    names = _one_of(kind)
+    if names is not None:
+        return next((each for each in names if str(each) == text), _UNFIT)
+    if bare is type(None):
         return None if text.lower() == "none" else _UNFIT
-    if kind is bool:
+    if bare is bool:
         return {"true": True, "false": False, "1": True, "0": False}.get(text.lower(), _UNFIT)
-    if origin is tuple:
+    if typing.get_origin(bare) is tuple:
         pieces = text.replace(":", ",").split(",")
-        kinds = [inner[0]] * len(pieces) if inner[-1] is Ellipsis else list(inner)
+        kinds = _each(typing.get_args(bare), len(pieces))
         if len(kinds) != len(pieces):
             return _UNFIT
         values = tuple(_parse(piece, k) for piece, k in zip(pieces, kinds, strict=True))
         return _UNFIT if _UNFIT in values else values
-    if origin is typing.Literal:
-        return next((each for each in inner if str(each) == text), _UNFIT)
     try:
-        value = kind(text)
+        value = bare(text)
     except ValueError:
         return _UNFIT
     return value if fits(value, kind) else _UNFIT

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate, register
+from agents.localizer import Estimate
 from agents.stein import reckoning
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
@@ -52,7 +52,6 @@ class _Graph:
     start: Float64[Tensor, "N T P"]
 
 
-@register("pose_graph")
 class PoseGraph(RelativeTeam[History]):
     """All poses of all UAVs at all steps, from all odometry and matches, whatever the network.
 

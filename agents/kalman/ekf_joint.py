@@ -12,12 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.kalman.ekf import (
-    GaussianBelief,
-    elapsed,
-    gaussian_estimate,
-)
-from agents.localizer import Estimate, Localizer, register
+from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
+from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, Neighbours, make_measurements
 from agents.models.process import make_process
 from agents.models.update import posterior
@@ -26,7 +22,6 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
 
-@register("ekf_joint")
 class JointEkf(Localizer[GaussianBelief]):
     """Centralized EKF of the team's joint state; options as ``ekf`` has them.
 

@@ -12,8 +12,9 @@ from jaxtyping import Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.kalman.ekf import DeadReckoning, GaussianBelief, elapsed, gaussian_estimate
-from agents.localizer import Estimate, Localizer, register
+from agents.kalman.dead_reckoning import DeadReckoning
+from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
+from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, make_measurements, nobody
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
@@ -46,7 +47,6 @@ class _Window:
     dt: Float64[Tensor, "B N L"]
 
 
-@register("emvf")
 class MinimumVarianceFir(Localizer[WindowBelief]):
     """FIR filter over the last ``memory`` steps, Gauss–Newton from a trilateration.
 

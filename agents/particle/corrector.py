@@ -13,8 +13,8 @@ HIDDEN = 12
 class WeightCorrector(Learned):
     """6–12–1 network of equations 12–13: y = σ(W₂ tanh(W₁ f + b₁) + b₂) ∈ (0, 1).
 
-    ``f`` = [p − p̂₋, v − v̂₋] (equation 11): how far a particle is from the last estimate, m and m/s,
-    world frame; in the plane the vertical components are 0.
+    ``f`` = [p − p̂₋, v − v̂₋] (equation 11): how far a particle is from the last estimate, m and
+    m/s, world frame; in the plane the vertical components are 0.
     """
 
     kind = "pfnn"

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate, Localizer, make, register
+from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
-from agents.particle.failure import ChiSquare, Detector, FailureDetector, NeuralDetector, evidence
+from agents.particle.failure import Detector, evidence
+from agents.registry import make
 from agents.tensorclasses import build
-from agents.weights import learned
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
@@ -149,49 +149,3 @@ class HybridFilter(Localizer[HybridBelief]):
         if self.model.tags:
             return self.main.mean(main)
         return estimate.position
-
-
-@register("hpff")
-class Hpff(HybridFilter):
-    """Hybrid particle/FIR filter: a failure is a Mahalanobis distance of the ranges beyond the
-    ``quantile`` of χ² (one degree of freedom a range)."""
-
-    name = "hpff"
-
-    def __init__(
-        self,
-        believed: Believed,
-        *,
-        main: str = "pf",
-        auxiliary: str = "emvf",
-        quantile: float = 0.98,
-        patience: int = 1,
-    ) -> None:
-        sensor = believed.sensor(AnchorRanging)
-        most = 0 if sensor is None else len(sensor.anchors) * sensor.n_tags
-        super().__init__(believed, ChiSquare(quantile, most), main, auxiliary, 0.5, patience)
-
-
-@register("nnhpff")
-class NeuralHpff(HybridFilter):
-    """Hybrid particle/FIR filter: a failure is what a 5–10–5–2 network gives a probability above
-    ``threshold``. ``weights``: a checkpoint's name or path, or ``none``."""
-
-    name = "nnhpff"
-
-    def __init__(
-        self,
-        believed: Believed,
-        *,
-        main: str = "pf",
-        auxiliary: str = "emvf",
-        weights: str = "nnhpff",
-        threshold: float = 0.5,
-        patience: int = 1,
-    ) -> None:
-        network = learned(FailureDetector, weights).requires_grad_(False)
-        super().__init__(believed, NeuralDetector(network), main, auxiliary, threshold, patience)
-
-    def learn(self, network: FailureDetector) -> None:
-        """Judge by this network from now on."""
-        self.detector = NeuralDetector(network)

@@ -6,7 +6,7 @@ from jaxtyping import Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate, register
+from agents.localizer import Estimate
 from agents.particle.belief import normal, own_keys
 from agents.particle.cloud import effective_sample_size, systematic
 from agents.stein import reckoning
@@ -33,7 +33,6 @@ class TeamCloud(TensorClass):
     step: Int64[Tensor, "B N"]
 
 
-@register("pf_joint")
 class TeamParticleFilter(RelativeTeam[TeamCloud]):
     """Bootstrap filter of the team's joint poses, which sees every match, whatever the network.
 

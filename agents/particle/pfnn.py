@@ -6,15 +6,13 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.localizer import register
+from agents.particle.apf import AdaptiveParticleFilter
 from agents.particle.belief import ParticleBelief
 from agents.particle.corrector import WeightCorrector, motion_features
-from agents.particle.pf import AdaptiveParticleFilter
 from agents.weights import learned
 from coloc_env.scenario import Believed
 
 
-@register("pfnn")
 class NeuralParticleFilter(AdaptiveParticleFilter):
     """Adaptive particle filter whose weights a small network corrects by each particle's motion.
 

@@ -29,8 +29,8 @@ def from_prior(
     key: Int64[Tensor, "B N"],
     slots: int,
 ) -> Float32[Tensor, "B N M S"]:
-    """x = x̄ ⊞ √diag(P) ε; where the prior is uniform, positions are so in the arena, and velocities
-    within ±``max_speed`` along each axis where that is known."""
+    """x = x̄ ⊞ √diag(P) ε; where the prior is uniform, positions are so in the arena, and
+    velocities within ±``max_speed`` along each axis where that is known."""
     d = process.dim
     draws = normal(key, "pf.reset", process.error_size, slots)
     delta = draws * covariance.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)

@@ -7,7 +7,7 @@ from jaxtyping import Float32
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate, Localizer, register
+from agents.localizer import Estimate, Localizer
 from agents.policies.actor import Actor
 from agents.weights import card_of, drawn_from, load
 from agents.wrappers.correction import Correction
@@ -15,6 +15,7 @@ from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
+from coloc_env.sensors import Sensor
 
 
 def mode_of(believed: Believed, settings: dict[str, Any]) -> ActionMode:
@@ -57,6 +58,7 @@ class PolicyAgent(Localizer[PolicyBelief]):
     """
 
     name = "policy"
+    serves = (Sensor,)  # a policy reads what it was trained to read
 
     def __init__(self, believed: Believed, *, weights: str) -> None:
         super().__init__(believed)
@@ -123,33 +125,3 @@ class PolicyAgent(Localizer[PolicyBelief]):
 
 def _words(inputs: dict[str, Any]) -> str:
     return ", ".join(f"{name}[{width}]" for name, width in inputs.items())
-
-
-@register("mappo")
-class Mappo(PolicyAgent):
-    """A policy trained by ``coloc train mappo``. ``weights``: a checkpoint's name or path."""
-
-    name = "mappo"
-
-    def __init__(self, believed: Believed, *, weights: str = "mappo") -> None:
-        super().__init__(believed, weights=weights)
-
-
-@register("ippo")
-class Ippo(PolicyAgent):
-    """A policy trained by ``coloc train ippo``. ``weights``: a checkpoint's name or path."""
-
-    name = "ippo"
-
-    def __init__(self, believed: Believed, *, weights: str = "ippo") -> None:
-        super().__init__(believed, weights=weights)
-
-
-@register("sb3-ppo")
-class Sb3Ppo(PolicyAgent):
-    """A policy trained by ``coloc train sb3-ppo``. ``weights``: a checkpoint's name or path."""
-
-    name = "sb3-ppo"
-
-    def __init__(self, believed: Believed, *, weights: str = "sb3-ppo") -> None:
-        super().__init__(believed, weights=weights)

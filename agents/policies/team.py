@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.localizer import make
 from agents.policies.adapters import ParallelPolicy, check_part
+from agents.registry import make
 from agents.wrappers.correction import Correction, learners_mode
 from coloc_env.envs.actions import chosen_leaves
 from coloc_env.envs.pettingzoo import CoLocParallelEnv

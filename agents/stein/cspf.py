@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate, register
+from agents.localizer import Estimate
 from agents.particle.belief import normal, own_keys
 from agents.stein import consensus, reckoning
 from agents.stein import window as windows
@@ -66,7 +66,6 @@ class _Now:
     talking: Bool[Tensor, "B H R"]
 
 
-@register("cspf")
 class SteinFilter(RelativeTeam[SteinBelief]):
     """Stein particles of the team's poses, one cloud a UAV, that agree by consensus.
 

@@ -13,8 +13,8 @@ from jaxtyping import Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.kalman.ekf import gaussian_estimate
-from agents.localizer import Estimate, Localizer, register
+from agents.kalman.filter import gaussian_estimate
+from agents.localizer import Estimate, Localizer
 from agents.models import preintegration
 from agents.models.measurements import Block, LandmarkVectors, nobody
 from agents.models.preintegration import Preintegrated
@@ -51,7 +51,6 @@ class SteinViBelief(TensorClass):
     step: Int64[Tensor, "B N"]
 
 
-@register("stein_vi")
 class SteinViFilter(Localizer[SteinViBelief]):
     """Stein particles of one UAV by IMU and landmarks, each UAV for itself.
 
@@ -62,6 +61,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
     """
 
     name = "stein_vi"
+    serves = (Landmarks, Imu)
 
     def __init__(
         self,

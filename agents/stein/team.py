@@ -28,6 +28,8 @@ class RelativeTeam(Localizer[B]):
     believed to be wrong, uniform over the arena and all rotations. ValueError without such a
     sensor, without odometry, or in a team with more UAVs than slots."""
 
+    serves = (RelativePose, Odometry)
+
     def __init__(self, believed: Believed, outliers: float, anneal: float) -> None:
         super().__init__(believed)
         arena = believed.arena

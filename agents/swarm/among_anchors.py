@@ -8,15 +8,15 @@ members of the team that know where they are.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.kalman.ekf import elapsed
-from agents.localizer import Estimate, Factory, Localizer
+from agents.kalman.filter import elapsed
+from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
 from agents.swarm import joint
 from agents.swarm.belief import Found, Prepared, SwarmBelief
@@ -29,6 +29,7 @@ from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import AnchorRanging, Ins, PositionFix, Ranging
 
+_M = TypeVar("_M", bound=SwarmFilter)
 _SURVEYED = 1e-3  # m: how well anchors' places are known, per axis
 
 
@@ -215,15 +216,17 @@ def is_plain(believed: Believed) -> bool:
     return not (lever_arms or believed.sensor(AnchorRanging) or process.error_size > process.dim)
 
 
-def suited(method: Factory) -> Factory:
-    """Builds a swarm filter or, for teams that are not plain, what makes one fit for them."""
+def suited(method: type[_M]) -> type[_M]:
+    """Decorator of a swarm filter: for teams that are not plain, ``agents.make`` builds what makes
+    one fit for them."""
 
     def build(believed: Believed, **chosen: Any) -> Localizer[Any]:
         if is_plain(believed):
             return method(believed, **chosen)
         return AmongAnchors(believed, partial(method, **chosen))
 
-    return build
+    method.suited = staticmethod(build)  # type: ignore[attr-defined]
+    return method
 
 
 def _at_rest(

@@ -7,7 +7,6 @@ from functools import partial
 
 import torch
 
-from agents.localizer import register
 from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
 from agents.swarm.filter import SwarmFilter
@@ -18,7 +17,7 @@ from agents.swarm.weights import loess
 from coloc_env.scenario import Believed
 
 
-@register("dwmds", suited)
+@suited
 class CostaMds(SwarmFilter):
     """Each UAV minimizes the stress of its own links, its neighbours held; all at once, sweep after
     sweep (Jacobi, over-relaxed as far as the stress surely falls), from where dead reckoning is.

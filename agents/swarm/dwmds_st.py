@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from agents.kalman.ekf import elapsed
-from agents.localizer import register
+from agents.kalman.filter import elapsed
 from agents.swarm import joint, window
 from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief
@@ -27,7 +26,7 @@ _FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
 _RELAXED = 1.8  # of a Guttman step, which overestimates how much many ranges hold together
 
 
-@register("dwmds_st", suited)
+@suited
 class DynamicMds(SwarmFilter):
     """Whole-team stress majorization with a recursive prior from dead reckoning.
 

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from agents.localizer import register
 from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
 from agents.swarm.links import connected, lengths
@@ -22,7 +21,7 @@ from agents.swarm.spread import spread, told
 from coloc_env.scenario import Believed
 
 
-@register("fcmds", suited)
+@suited
 class FullyConnectedMds(MdsMap):
     """Majorization in which every pair of a connected part counts alike: measured distances stay,
     missing ones are read off the map anew in every iteration. UAVs with fixes stay; no prior.

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from agents.kalman.ekf import elapsed
+from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import make_process
 from agents.swarm import (
@@ -28,7 +28,7 @@ from agents.swarm.window import History
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import Ins, PositionFix, Ranging
+from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
 
 Confidence = Literal["none", "huber", "em", "paper"]
 
@@ -41,6 +41,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
+    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight)  # some among anchors only
     window = 0  # steps that are remembered besides the present one
     decay = 0.0  # 1/s: at what rate they fade
     recursive = True  # what it finds has dead reckoning in it, and is not news to that

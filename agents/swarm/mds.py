@@ -2,7 +2,6 @@
 
 import torch
 
-from agents.localizer import register
 from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import SwarmFilter
@@ -10,7 +9,7 @@ from agents.swarm.scaling import aligned, classical_scaling, shortest_paths
 from coloc_env.scenario import Believed
 
 
-@register("mds", suited)
+@suited
 class MdsMap(SwarmFilter):
     """Shortest paths, classical scaling, and the turn, mirror and shift that fit UAVs with fixes
     (everybody's dead reckoning, where fewer than ``dim`` + 1 are connected).

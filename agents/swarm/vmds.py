@@ -9,7 +9,6 @@ from functools import partial
 
 import torch
 
-from agents.localizer import register
 from agents.swarm.among_anchors import suited
 from agents.swarm.belief import Found, Prepared, SwarmBelief, begun
 from agents.swarm.filter import Confidence, SwarmFilter
@@ -20,7 +19,7 @@ from coloc_env.scenario import Believed
 _ROUNDS = 2  # of weights in a step
 
 
-@register("vmds", suited)
+@suited
 class VelocityMds(SwarmFilter):
     """Σ W_ij (d_ij − ‖p_i − p_j‖)² + λ_s Σ ‖(p_i(t) − p_i(t−1))/Δt − v_i‖² over p(t), with v what
     the INS says (dead reckoning's step, where there is none), by majorization of the whole team.

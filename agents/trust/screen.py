@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -29,6 +30,7 @@ from agents.trust.features import (
     remembered,
 )
 from agents.trust.network import SHARED, TrustNetwork
+from agents.weights import learned
 from coloc_env.observation import Observation
 
 _RANGES = (AnchorRanges, UavRanges)
@@ -117,3 +119,12 @@ class TrustScreen(Screen):
             for memory, first in zip(evidence.memory, evidence.first, strict=True)
         ]
         return torch.cat((evidence.lately, *parts), -1).to(prediction.memory.dtype)
+
+
+def learned_screen(
+    process: Process, models: Sequence[Measurement], weights: str, options: dict[str, Any]
+) -> TrustScreen:
+    """The screen that judges by a checkpoint's networks, and by nothing beside them."""
+    if options.get("robust", "none") != "none":
+        raise ValueError("robust is not allowed beside learned trust: none")
+    return TrustScreen(process, models, learned(TrustNetwork, weights).requires_grad_(False))

@@ -7,12 +7,13 @@ from jaxtyping import Float32
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Localizer, make
+from agents.localizer import Localizer
 from agents.models.measurements import heard, make_measurements
 from agents.models.measurements.bearings import UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights
 from agents.models.process import make_process
+from agents.registry import make
 from agents.wrappers.residuals import pulls, robust_statistics
 from coloc_env.envs.actions import ActionMode, Leaves
 from coloc_env.envs.displacement import Displacement

@@ -8,7 +8,6 @@ from coloc_env.motion import Arena, Box, Court, Motion, Patrol, Split
 from coloc_env.network import Network
 from coloc_env.reference import SatelliteReference
 from coloc_env.scenario import InsDriven, Prior, Scenario
-from coloc_env.scenarios.registry import register
 from coloc_env.sensors import Clock, Ins, PositionFix, RangeNoise, Ranging, Sensor
 
 # Metres. Zone A is a court without obstacles, zone B what surrounds the building.
@@ -36,7 +35,6 @@ _FLIGHTS: dict[str, tuple[Motion, int]] = {  # and how many s they take
 }
 
 
-@register("campus-v0")
 def campus(
     *,
     flight: Literal["s1", "s2", "s3"] = "s2",

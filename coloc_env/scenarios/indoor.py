@@ -6,11 +6,9 @@ from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Process, Scenario
 from coloc_env.scenarios.parts import anchor_places, blocked_anchors, kidnapped_at
-from coloc_env.scenarios.registry import register
 from coloc_env.sensors import AnchorRanging, Imu, Landmarks, RangeNoise, Ranging, Sensor
 
 
-@register("indoor-v0")
 def indoor(
     *,
     n_uavs: int = 6,

@@ -1,42 +1,48 @@
 """Scenarios by id: what exists, which overrides each takes, clear words for the rest."""
 
-import inspect
-from collections.abc import Callable
+from __future__ import annotations
+
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coloc_env import options
-from coloc_env.scenario import Scenario
+from coloc_env.registry import Registry
 
-Family = Callable[..., Scenario]
-FAMILIES: dict[str, Family] = {}
+if TYPE_CHECKING:
+    from coloc_env.scenario import Scenario
 
-
-def register(name: str) -> Callable[[Family], Family]:
-    """Register a scenario family: a function of keyword-only overrides that returns a Scenario."""
-
-    def add(family: Family) -> Family:
-        FAMILIES[name] = family
-        return family
-
-    return add
-
-
-def overrides_of(name: str) -> dict[str, inspect.Parameter]:
-    """Override names of a scenario with their types and defaults."""
-    options.require_known("scenario", [name], sorted(FAMILIES))
-    return options.parameters(FAMILIES[name])
+SCENARIOS = Registry(
+    "scenario",
+    "coloc.scenarios",
+    {
+        "campus-v0": "coloc_env.scenarios.campus:campus",
+        "indoor-v0": "coloc_env.scenarios.indoor:indoor",
+        "replay-euroc-v0": "coloc_env.scenarios.replay_euroc:replay_euroc",
+        "replay-hanyang-v0": "coloc_env.scenarios.replay_hanyang:replay_hanyang",
+        "replay-miluv-v0": "coloc_env.scenarios.replay_miluv:replay_miluv",
+        "replay-mrclam-v0": "coloc_env.scenarios.replay_mrclam:replay_mrclam",
+        "replay-murp-v0": "coloc_env.scenarios.replay_murp:replay_murp",
+        "replay-stein-euroc-v0": "coloc_env.scenarios.replay_stein_euroc:replay_stein_euroc",
+        "replay-tiers-v0": "coloc_env.scenarios.replay_tiers:replay_tiers",
+        "replay-tuc-v0": "coloc_env.scenarios.replay_tuc:replay_tuc",
+        "stein2d-v0": "coloc_env.scenarios.stein:stein2d",
+        "stein3d-v0": "coloc_env.scenarios.stein:stein3d",
+        "swarm-v0": "coloc_env.scenarios.swarm:swarm",
+        "wsn-v0": "coloc_env.scenarios.wsn:wsn",
+    },
+)
 
 
 def make_scenario(name: str, **overrides: Any) -> Scenario:
-    """Build a registered scenario.
+    """Build a scenario by its id.
 
     Raises ValueError, in one line that names what is allowed, for an unknown scenario, an unknown
     override, or a value of the wrong type or range.
     """
-    options.check(name, overrides, overrides_of(name))
+    family = SCENARIOS.require(name)
+    overrides = options.checked(name, overrides, SCENARIOS.options_of(name))
     try:
-        return replace(FAMILIES[name](**overrides), overrides=overrides)
+        return replace(family(**options.grouped(family, overrides)), overrides=overrides)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
@@ -51,6 +57,12 @@ def scenario_from(scenario: str | Scenario, overrides: dict[str, Any]) -> Scenar
     return scenario
 
 
+def parse_scenario(text: str) -> Scenario:
+    """A scenario with overrides as on a command line: ``indoor-v0:nlos=0.3:horizon=200``."""
+    name, *overrides = text.split(":")
+    return make_scenario(name, **dict(parse_override(name, one) for one in overrides))
+
+
 def parse_override(name: str, text: str) -> tuple[str, Any]:
     """``key=value`` from a command line, the value read as the override's type."""
-    return options.parse(name, text, overrides_of(name))
+    return options.parse(name, text, SCENARIOS.options_of(name))

@@ -1,7 +1,6 @@
-"""``replay-tuc-v0``, ``replay-hanyang-v0``: recordings of one tag in the plane among anchors."""
+"""Parts of scenarios that replay one tag in the plane among anchors."""
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -14,9 +13,8 @@ from coloc_env.datasets.replay import (
     recorded_odometry,
 )
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, Prior, Process, Scenario, Wheeled
-from coloc_env.scenarios.registry import register
-from coloc_env.scenarios.replay import cut, loaded
+from coloc_env.scenario import Prior, Process, Scenario
+from coloc_env.scenarios.replay import cut
 from coloc_env.sensors import AnchorRanging, Odometry, RangeNoise, Sensor
 
 
@@ -70,78 +68,3 @@ def anchor_scenario(
         believed_sensors=tuple(believed),
         reward=reward,
     )
-
-
-@register("replay-tuc-v0")
-def replay_tuc(
-    *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.128,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    prior_std: float = 0.5,
-    prior: str = "gaussian",
-    max_speed: float = 0.5,
-    process: Literal["wheeled", "constant_velocity"] = "wheeled",
-    range_std: float = 0.15,
-    range_bias: float = 0.11,
-    velocity_accel_std: float = 0.5,
-    forward_std: float = 0.05,
-    turn_std: float = 0.2,
-) -> Scenario:
-    """A wheeled robot for 30 s in a square of 2.4 m among four anchors (TU Chemnitz "Labyrinth"):
-    odometry and one range a step. Nothing is simulated but the prior's draw.
-
-    ``process="constant_velocity"`` leaves the odometry out: velocity driven by
-    ``velocity_accel_std``. ``range_bias`` (m) is taken off every range. It and the noise settings
-    were chosen on the first 15 s. On the rest the EKF is off by 0.099 m RMS (Huber 0.090), without
-    odometry by 0.150 (0.144), without taking the bias off by 0.189 and 0.241. Stamps drift against
-    the steps: from 23 s on a range is delivered 0.08 s, from 25 s on 0.05 s after it was measured,
-    and a few of the last steps have no truth near enough to be scored.
-    """
-    recording = corrected(loaded("tuc", sequence, data), 0.0, range_bias)
-    grid = ranging_grid(recording, dt, span, margin=0.001)
-    model: Process = ConstantVelocity(velocity_accel_std)
-    odometry = None
-    if process == "wheeled":
-        model, odometry = Wheeled(), Odometry(forward_std, 0.5 * forward_std, turn_std)
-    told = Prior(prior_std, 0.1, 0.2, prior, max_speed if prior == "uniform" else None)
-    return anchor_scenario(
-        "replay-tuc-v0", recording, grid, told, model, range_std, reward, odometry
-    )
-
-
-@register("replay-hanyang-v0")
-def replay_hanyang(
-    *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.1,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    prior_std: float = 1.0,
-    prior: str = "gaussian",
-    max_speed: float = 1.5,
-    range_delay: float = 0.18,
-    range_std: float = 0.2,
-    velocity_accel_std: float = 0.5,
-) -> Scenario:
-    """A tag on the ground for 3 to 5 min, up to 50 m from four anchors within 5 m of each other
-    (Hanyang University): ranges, one in 200 too short by 1 to 19 m. Nothing is simulated but the
-    prior's draw.
-
-    Ranges are taken to be ``range_delay`` s older than their stamps, and delivered at once: a step
-    has those of the last 0.1 s by that clock (0 uses them as they are stamped). The noise settings
-    were chosen on LOS/Trajectory_B/Case_3, the delay is the same in all cases. On the others the
-    Huber EKF is off by 0.80, 0.79 and 0.40 m RMS (LOS A, NLOS A, NLOS B), the plain EKF, which
-    believes every range, by 1.9, 6.7 and 2.0. Every fifth step has no truth within 50 ms and is not
-    scored.
-    """
-    if range_delay < 0:
-        raise ValueError("range_delay is a time in s ≥ 0")
-    recording = corrected(loaded("hanyang", sequence, data), range_delay, 0.0)
-    grid = ranging_grid(recording, dt, span, margin=0.04)
-    told = Prior(prior_std, 0.1, 0.2, prior, max_speed if prior == "uniform" else None)
-    model = ConstantVelocity(velocity_accel_std)
-    return anchor_scenario("replay-hanyang-v0", recording, grid, told, model, range_std, reward)

@@ -17,7 +17,6 @@ from coloc_env.datasets.replay import arena_of, lever_arms, recorded_motion, rec
 from coloc_env.geometry import Se3
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario
-from coloc_env.scenarios.registry import register
 from coloc_env.scenarios.replay import cut, loaded
 from coloc_env.sensors import Odometry, Ranging, RecordedPoses, Reference, RelativePose
 from coloc_env.series import Tape
@@ -89,7 +88,6 @@ def solved(recording: Recording, steps: int) -> Solved:
     )
 
 
-@register("replay-murp-v0")
 def replay_murp(
     *,
     sequence: str | None = None,

@@ -10,7 +10,6 @@ import torch
 from coloc_env.motion import MOTIONS, Arena, Motion, Recorded
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Prior, Process, Scenario, Wheeled
-from coloc_env.scenarios.registry import register
 from coloc_env.sensors import Odometry, Reference, RelativePose
 from coloc_env.series import Tape
 
@@ -18,7 +17,6 @@ _SPACING = 2.0  # m, of the lattice on which a static team stands (eq. 27)
 _LATTICE = (0, 1, 2)
 
 
-@register("stein2d-v0")
 def stein2d(
     *,
     n_uavs: int = 3,
@@ -46,7 +44,6 @@ def stein2d(
     return _stein(dim=2, name="stein2d-v0", **locals())
 
 
-@register("stein3d-v0")
 def stein3d(
     *,
     n_uavs: int = 3,

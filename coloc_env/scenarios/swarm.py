@@ -6,14 +6,12 @@ from typing import Literal
 from coloc_env.motion import Arena, Box
 from coloc_env.network import Network
 from coloc_env.scenario import InsDriven, Prior, Scenario
-from coloc_env.scenarios.registry import register
 from coloc_env.scenarios.swarm_motions import SwarmMotion, swarm_motion
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging, Sensor
 
 _ARM = 0.3  # width of the arms of a U or an O, of the side
 
 
-@register("swarm-v0")
 def swarm(
     *,
     n_uavs: int = 200,

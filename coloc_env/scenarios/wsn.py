@@ -7,7 +7,6 @@ from coloc_env.motion import Arena, Square
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario
 from coloc_env.scenarios.parts import anchor_places, blocked_anchors, kidnapped_at
-from coloc_env.scenarios.registry import register
 from coloc_env.sensors import AnchorRanging, RangeNoise
 
 _SIDE = 10.0  # m, of the room
@@ -15,7 +14,6 @@ _R = 0.04  # m², of the ranges
 CASES = {1: (_R, 1.0), 2: (_R / 25, 1.0), 3: (9 * _R, 0.06**2)}  # believed r (m²), q (m²/s⁴)
 
 
-@register("wsn-v0")
 def wsn(
     *,
     case: Literal[1, 2, 3] = 1,

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped
@@ -70,6 +70,9 @@ class Sensor(ABC):
     The same class describes what a team *believes* of the sensor (``scenario.believed.sensors``),
     so a localizer finds the noise model it should assume under the sensor's type.
     """
+
+    informs: ClassVar[bool] = True
+    """Whether its leaves tell of where UAVs are (a frame that estimates are stated in does not)."""
 
     @property
     def delay(self) -> int:

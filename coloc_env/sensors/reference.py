@@ -20,6 +20,8 @@ class Reference(Sensor):
     motion from it would know more than its sensors say.
     """
 
+    informs = False
+
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return {"reference": Leaf(poses_in(layout.arena.dim).size)}
 

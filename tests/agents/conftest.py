@@ -11,7 +11,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from agents import LOCALIZERS, Estimate, Localizer, make, options_of
+from agents import LOCALIZERS, Estimate, Localizer, make
 from agents.models.measurements import Block, Measurement, Neighbours
 from agents.models.process import Process
 from coloc_env import scenario as settings
@@ -154,7 +154,7 @@ class Case:
 
 def build(name: str, scenario: Scenario) -> Localizer:
     """The localizer, with few particles if it has any."""
-    known = options_of(name.split(":")[0])
+    known = LOCALIZERS.options_of(name.split(":")[0])
     few: dict[str, Any] = {"particles": PARTICLES} if "particles" in known else {}
     if "bounds" in known and known["bounds"].default is not None:
         few["bounds"] = (PARTICLES - 10, PARTICLES + 20)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from agents import LOCALIZERS, options_of
+from agents import LOCALIZERS
 from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 
@@ -99,7 +99,7 @@ def test_neighbours_are_used_where_they_are_heard(
 ) -> None:
     """Or the tests above could not fail: other messages make other estimates."""
     case = local_case
-    if "cooperate" not in options_of(case.name.split(":")[0]):
+    if "cooperate" not in LOCALIZERS.options_of(case.name.split(":")[0]):
         pytest.skip("does not cooperate")
     if case.family in ("wsn", "stein2d"):
         pytest.skip("no range or bearing is measured between UAVs")
@@ -114,7 +114,7 @@ def test_neighbours_are_used_where_they_are_heard(
 
 
 @pytest.mark.parametrize("family", ["default", "slots", "plane"])
-@pytest.mark.parametrize("name", [n for n in LOCALIZERS if "cooperate" in options_of(n)])
+@pytest.mark.parametrize("name", [n for n in LOCALIZERS if "cooperate" in LOCALIZERS.options_of(n)])
 def test_without_cooperation_other_uavs_do_not_matter(
     name: str, family: str, tools: SimpleNamespace
 ) -> None:

@@ -7,11 +7,11 @@ import pytest
 import torch
 from tensordict import is_tensorclass
 
-from agents import LOCALIZERS, make, options_of
+from agents import LOCALIZERS, make
 from agents.kalman.emvf import MinimumVarianceFir
 from agents.policies.learned import PolicyAgent
 from agents.stein.team import RelativeTeam
-from agents.swarm.map import Snapshot
+from agents.swarm.gn import Snapshot
 from coloc_env.observation import Observation, action_width
 
 EXACT = 0.0
@@ -167,7 +167,7 @@ def test_without_measurements_the_first_estimate_is_the_prior(
     estimate = tools.replay(case.localizer, [tools.change(first, **blind)]).estimates[0]
     prior = first["prior"].double()
     std = prior[..., -d - 2 : -2]
-    sampled = {"particles", "main"} & options_of(case.name.split(":")[0]).keys()
+    sampled = {"particles", "main"} & LOCALIZERS.options_of(case.name.split(":")[0]).keys()
     error = 5 / math.sqrt(33) if sampled else 1e-6
     torch.testing.assert_close(
         (estimate.position.double() - prior[..., :d]) / std,
@@ -184,7 +184,7 @@ def test_without_measurements_the_first_estimate_is_the_prior(
 # ---------------------------------------------------------------- seeds
 
 
-@pytest.mark.parametrize("name", [n for n in LOCALIZERS if "seed" in options_of(n)])
+@pytest.mark.parametrize("name", [n for n in LOCALIZERS if "seed" in LOCALIZERS.options_of(n)])
 def test_the_seed_changes_the_draws_and_nothing_else(name: str, tools: SimpleNamespace) -> None:
     scenario = tools.room(name)
     runs = [

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from agents import LOCALIZERS, Localizer, make, options_of, register
+from agents import LOCALIZERS, Localizer, make
 from agents.kalman.ekf import CooperativeEkf
 from agents.robust import RobustScreen
 from coloc_env.scenario import Believed, Scenario
@@ -26,7 +26,9 @@ def test_every_name_makes_a_localizer_from_beliefs_alone(
     localizer = make(name, scenario)
     assert isinstance(localizer, Localizer)
     assert localizer.believed is scenario.believed
-    assert all(option.default is not option.empty for option in options_of(name).values())
+    assert all(
+        option.default is not option.empty for option in LOCALIZERS.options_of(name).values()
+    )
 
 
 def test_options_come_by_keyword_or_in_the_name(scenario: Scenario) -> None:

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import LOCALIZERS, Estimate, Localizer
+from agents.localizer import Estimate, Localizer
+from agents.registry import LOCALIZERS
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.observation import Observation

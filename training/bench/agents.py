@@ -9,7 +9,7 @@ from typing import Any, cast
 from agents import LOCALIZERS, make
 from agents.factor_graph.pose_graph import PoseGraph
 from agents.particle.hybrid import HybridFilter
-from agents.stdcl.stdcl import NetworkLoop
+from agents.stdcl.loop import NetworkLoop
 from agents.stein.team import RelativeTeam
 from agents.swarm.filter import SwarmFilter
 from coloc_env.scenarios import make_scenario

@@ -14,7 +14,7 @@ from coloc_env.scenarios import make_scenario
 from training.bench.cases import Case, Timed
 from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
 from training.learning import sb3_ppo as _sb3_ppo  # noqa: F401
-from training.learning.run import TRAININGS
+from training.learning.registry import TRAININGS
 
 WORLDS, HORIZON = 64, 50
 _SCENE = make_scenario("indoor-v0", motion="random", horizon=HORIZON)

@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from training.cli.reproduce import reproduce
-from training.cli.terminal import explain, progress, show, summary
+from training.cli.terminal import explain, progress, show
 from training.cli.train import train
 
 if TYPE_CHECKING:
@@ -135,13 +135,13 @@ def scenarios(
     name: Annotated[str | None, typer.Argument(help="Show this scenario's settings.")] = None,
 ) -> None:
     """List the scenarios, or one scenario's settings with their types and defaults."""
-    from coloc_env.scenarios import FAMILIES, overrides_of
+    from coloc_env.scenarios import SCENARIOS
 
     if name is None:
-        show(["scenario", ""], [[key, summary(FAMILIES[key])] for key in sorted(FAMILIES)])
+        show(["scenario", ""], [[key, SCENARIOS.summary(key)] for key in SCENARIOS])
         typer.echo("coloc scenarios SCENARIO lists what can be --set in one.")
     else:
-        explain(name, overrides_of(name), "override", FAMILIES[name])
+        explain(name, SCENARIOS, "override")
 
 
 @app.command()
@@ -149,13 +149,13 @@ def agents(
     name: Annotated[str | None, typer.Argument(help="Show this agent's options.")] = None,
 ) -> None:
     """List the agents, or one agent's options with their types and defaults."""
-    from agents import LOCALIZERS, options_of
+    from agents import LOCALIZERS
 
     if name is None:
-        show(["agent", ""], [[key, summary(LOCALIZERS[key])] for key in sorted(LOCALIZERS)])
+        show(["agent", ""], [[key, LOCALIZERS.summary(key)] for key in LOCALIZERS])
         typer.echo("coloc agents AGENT lists its options, written AGENT:option=value:option=value.")
     else:
-        explain(name, options_of(name), "option", LOCALIZERS[name])
+        explain(name, LOCALIZERS, "option")
 
 
 @app.command()

@@ -1,7 +1,7 @@
 """What commands print on a terminal: tables, explanations and bars of progress."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,35 +11,30 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from coloc_env.options import paragraphs
+from coloc_env.registry import Registry
+
 _PIPED = 160  # columns of a table that no terminal shows
 
 
-def summary(function: Callable[..., Any]) -> str:
-    """The first paragraph of a docstring, in one line."""
-    return _paragraphs(function)[0]
-
-
-def _paragraphs(function: Callable[..., Any]) -> list[str]:
-    """A docstring's paragraphs, one line each; without a docstring, one that is empty."""
-    text = (inspect.getdoc(function) or "").replace("``", "")
-    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
-
-
-def explain(
-    name: str, known: Mapping[str, inspect.Parameter], kind: str, function: Callable[..., Any]
-) -> None:
-    """Print what ``function``, registered as ``name``, is by its docstring, and its ``known``
-    parameters, each a ``kind`` (a singular noun), with types and defaults."""
-    from coloc_env.options import describe
+def explain(name: str, registry: Registry, kind: str) -> None:
+    """Print what a registered name is by its docstring, and its options (each a ``kind``, a
+    singular noun) in groups, with units, what is allowed, and defaults."""
     from training.evaluation.results import typed
 
-    text = "\n\n".join(map(escape, _paragraphs(function)))
+    known = registry.options_of(name)
+    text = "\n\n".join(map(escape, paragraphs(inspect.getdoc(registry[name]) or "")))
     Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
-    lines = [[key, describe(p.annotation), typed(p.default)] for key, p in known.items()]
-    if lines:
-        show([kind, "type", "default"], lines)
-    else:
+    if not known:
         typer.echo(f"no {kind}s")
+    groups = dict.fromkeys(option.group for option in known.values())
+    for group in sorted(groups, key=bool):  # those of the function itself first
+        lines = [
+            [option.name, option.words, typed(option.default)]
+            for option in known.values()
+            if option.group == group
+        ]
+        show([group or kind, "allowed", "default"], lines)
 
 
 def show(header: list[str], lines: list[list[str]]) -> None:

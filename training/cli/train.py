@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from training.cli.terminal import explain, progress, show, summary
+from training.cli.terminal import explain, progress, show
 
 
 def train(
@@ -63,32 +63,27 @@ def train(
 
     torch.set_num_threads(threads)
     from coloc_env.options import parse
-    from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
-    from training.learning import nnhpff as _nnhpff  # noqa: F401
-    from training.learning import pfnn as _pfnn  # noqa: F401
-    from training.learning import run as runs
-    from training.learning import sb3_ppo as _sb3_ppo  # noqa: F401
-    from training.learning import stdcl as _stdcl  # noqa: F401
-    from training.learning import trust as _trust  # noqa: F401
+    from training.learning import run
+    from training.learning.registry import TRAININGS
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer it makes
     if resume is not None:
         if name is not None or out is not None or settings:
             raise ValueError("--resume goes alone: a run continues as it was started")
         with progress() as tell:
-            weights = runs.resume(resume, tell)
+            weights = run.resume(resume, tell)
     elif name is None:
-        show(["training", ""], [[k, summary(v)] for k, v in sorted(runs.TRAININGS.items())])
+        show(["training", ""], [[key, TRAININGS.summary(key)] for key in TRAININGS])
         typer.echo("coloc train TRAINING lists its options.")
         return
     elif out is None:
         if settings:
             raise ValueError("--out DIR is needed: the run's folder")
-        explain(name, runs.options_of(name), "option", runs.TRAININGS[name])
+        explain(name, TRAININGS, "option")
         return
     else:
-        known = runs.options_of(name)
+        known = TRAININGS.options_of(name)
         chosen = dict(parse(name, text, known) for text in settings or ())
         with progress() as tell:
-            weights = runs.start(name, chosen, out, tell)
+            weights = run.start(name, chosen, out, tell)
     typer.echo(f"weights written to {weights}")

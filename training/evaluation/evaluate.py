@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 
 import agents as _agents  # noqa: F401  (registers the localizers)
-from agents.localizer import Localizer, make
+from agents.localizer import Localizer
+from agents.registry import make
 from coloc_env.bounds import Bound, posterior_bound
 from coloc_env.scenario import Scenario
 from coloc_env.world import World

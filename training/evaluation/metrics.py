@@ -1,7 +1,7 @@
 """Figures of merit from arrays [runs R, steps K, UAVs N]; lengths in m.
 
-``error`` is ‖p̂ − p‖, ``offset`` the vector p̂ − p [R, K, N, d], ``scored`` says which entries count.
-Where nothing counts the answer is NaN.
+``error`` is ‖p̂ − p‖, ``offset`` the vector p̂ − p [R, K, N, d], ``scored`` says which entries
+count. Where nothing counts the answer is NaN.
 """
 
 import warnings

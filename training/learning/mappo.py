@@ -28,6 +28,7 @@ from agents.wrappers.correction import learners_mode
 from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
+from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
 from training.evaluation.rollout import play
 from training.learning.collectors import Flights, fly, world_seed
@@ -38,8 +39,6 @@ from training.learning.run import (
     at_least,
     make_trainer,
     positive,
-    register,
-    scenario_of,
     shares,
 )
 
@@ -118,7 +117,7 @@ def _ppo(
     at_least(name, 0, score_runs=score_runs, seed=seed)
     positive(name, learning_rate=learning_rate, clip=clip)
     shares(name, gamma=gamma, gae_lambda=gae_lambda, entropy=entropy)
-    scenes = [scenario_of(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
+    scenes = [parse_scenario(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
     if worlds % len(scenes) or any(scene.horizon < steps for scene in scenes):
         raise ValueError(
             f"{name}: worlds={worlds} must be a multiple of the {len(scenes)} variants, and no "
@@ -195,7 +194,6 @@ def _ppo(
     )
 
 
-@register
 @wraps(_ppo, assigned=())
 def mappo(**options: Any) -> Training:
     """A policy for every UAV, with a critic that sees the team's truth (MAPPO, Yu et al. 2022).
@@ -210,7 +208,6 @@ def mappo(**options: Any) -> Training:
     return _ppo("mappo", MAPPOLoss, ("observation", "state"), **options)
 
 
-@register
 @wraps(_ppo, assigned=())
 def ippo(**options: Any) -> Training:
     """A policy for every UAV, with a critic of its own observation (IPPO, de Witt et al. 2020).

@@ -20,12 +20,13 @@ from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
+from coloc_env.scenarios import parse_scenario
 from coloc_env.sensors import AnchorRanging
 from training.evaluation.rollout import play
 from training.learning.collectors import Flights, fly, world_seed
 from training.learning.fleets import SideBySide
 from training.learning.offline import offline_trainer
-from training.learning.run import Progress, Training, at_least, positive, register, scenario_of
+from training.learning.run import Progress, Training, at_least, positive
 
 FAILED = 0.5  # m: an estimate farther off has failed
 # Low, medium and high: the team's beliefs of the acceleration (m²/s⁴) and of ranges (m²), and the
@@ -95,7 +96,6 @@ def _anchors(scenario: Scenario) -> int:
     return 0 if sensor is None else len(sensor.anchors)
 
 
-@register
 def nnhpff(
     *,
     scenario: str = "wsn-v0",
@@ -120,7 +120,7 @@ def nnhpff(
     at_least("nnhpff", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
     at_least("nnhpff", 0, score_runs=score_runs, seed=seed)
     positive("nnhpff", learning_rate=learning_rate)
-    scenes = [scenario_of(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
+    scenes = [parse_scenario(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
     kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenes}
     if len(kinds) > 1:
         raise ValueError(
@@ -185,7 +185,7 @@ def score(detector: FailureDetector, base: str, runs: int, tell: Progress) -> Ma
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
     for case in (1, 2, 3):
-        scene = scenario_of(f"{base}:case={case}")
+        scene = parse_scenario(f"{base}:case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
             options = {"weights": "none"} if name == "nnhpff" else {}

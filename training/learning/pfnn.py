@@ -21,6 +21,7 @@ from agents.policies.adapters import LocalizerPolicy
 from coloc_env import noise
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
+from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
 from training.evaluation.rollout import play
 from training.learning.collectors import Flight, Flights, fly, world_seed
@@ -31,8 +32,6 @@ from training.learning.run import (
     at_least,
     make_trainer,
     positive,
-    register,
-    scenario_of,
 )
 
 EVERY = 10  # steps between trainings (section 2.3)
@@ -118,7 +117,6 @@ class InTurn:
         return samples_of(batch)[:, next(self.turn)]
 
 
-@register
 def pfnn(
     *,
     mode: Literal["offline", "online"] = "offline",
@@ -144,7 +142,7 @@ def pfnn(
     at_least("pfnn", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
     at_least("pfnn", 0, score_runs=score_runs, seed=seed)
     positive("pfnn", learning_rate=learning_rate)
-    scene = scenario_of(scenario)
+    scene = parse_scenario(scenario)
     if scene.horizon < EVERY:
         raise ValueError(f"pfnn: a horizon of {scene.horizon} steps is too short: {EVERY} at least")
     localizer: Any = make("pfnn", scene, weights="none", seed=seed)

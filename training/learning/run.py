@@ -22,14 +22,13 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from agents.weights import SUFFIX, Learned
 from coloc_env import options
-from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario, parse_override
 from coloc_env.staging import staged_folder
 from training.evaluation.results import typed
 from training.learning import checkpoints
 from training.learning import state as savepoints
 from training.learning.collectors import Flights
 from training.learning.logger import RunLogger
+from training.learning.registry import TRAININGS
 
 Progress = Callable[[str, int, int], None]
 _CONFIG, _STATE = "run.json", "state.safetensors"
@@ -81,22 +80,6 @@ class _Stepper(DefaultOptimizationStepper):
         return super().step(trainer, sub_batch).detach()
 
 
-TRAININGS: dict[str, Callable[..., Training]] = {}
-
-
-def register(factory: Callable[..., Training]) -> Callable[..., Training]:
-    """Register a training under its function's name (``sb3-ppo`` for ``sb3_ppo``); its keyword-only
-    parameters are options."""
-    TRAININGS[factory.__name__.replace("_", "-")] = factory
-    return factory
-
-
-def options_of(name: str) -> dict[str, Any]:
-    """Option names of a training with their types and defaults."""
-    options.require_known("training", [name], sorted(TRAININGS))
-    return options.parameters(TRAININGS[name])
-
-
 def at_least(training: str, least: int, **chosen: int) -> None:
     """ValueError for a whole number chosen below ``least``, or beyond all sense."""
     for name, value in chosen.items():
@@ -116,12 +99,6 @@ def shares(training: str, **chosen: float) -> None:
     for key, value in chosen.items():
         if not 0 <= value <= 1:
             raise ValueError(f"{training}: {key}={value} is not allowed: a number in [0, 1]")
-
-
-def scenario_of(text: str) -> Scenario:
-    """A scenario with overrides as in ``indoor-v0:nlos=0.3:horizon=200``."""
-    name, *overrides = text.split(":")
-    return make_scenario(name, **dict(parse_override(name, one) for one in overrides))
 
 
 def make_trainer(
@@ -155,7 +132,7 @@ def make_trainer(
 
 def start(name: str, chosen: Mapping[str, Any], out: Path, tell: Progress) -> Path:
     """Train from the beginning, in the directory ``out``; returns the weights' file."""
-    options.check(name, chosen, options_of(name))
+    chosen = options.checked(name, chosen, TRAININGS.options_of(name))
     if (out / _CONFIG).exists():
         raise ValueError(f"{out} holds a run: --resume {out} continues it")
     if out.is_dir() and any(out.iterdir()):
@@ -205,7 +182,8 @@ def _go_on(folder: Path, config: Mapping[str, Any], tell: Progress) -> Path:
     card = {
         "command": config["command"],
         "training": name,
-        "options": {key: p.default for key, p in options_of(name).items()} | config["options"],
+        "options": {key: p.default for key, p in TRAININGS.options_of(name).items()}
+        | config["options"],
         "epochs": flights.epochs,
         "frames": trainer.collected_frames,
         "versions": _versions(),
@@ -230,7 +208,8 @@ def _config(folder: Path) -> dict[str, Any]:
     for key, kind in needed.items():
         if not isinstance(config, dict) or not isinstance(config.get(key), kind):
             raise ValueError(f"{file} describes no run: {', '.join(needed)} are needed")
-    options.check(config["training"], config["options"], options_of(config["training"]))
+    name = config["training"]
+    config["options"] = options.checked(name, config["options"], TRAININGS.options_of(name))
     return config
 
 

@@ -17,9 +17,10 @@ from agents.policies.actor import Actor
 from agents.policies.learned import actor_for
 from agents.wrappers.correction import learners_mode
 from coloc_env.envs.sb3 import CoLocVecEnv
+from coloc_env.scenarios import parse_scenario
 from training.learning.collectors import world_seed
 from training.learning.mappo import score
-from training.learning.run import Training, at_least, positive, register, scenario_of, shares
+from training.learning.run import Training, at_least, positive, shares
 
 _RUNNING = ("obs_rms", "ret_rms")
 
@@ -149,7 +150,6 @@ class _Metrics(KVWriter):
     def close(self) -> None: ...
 
 
-@register
 def sb3_ppo(
     *,
     scenario: str = "indoor-v0:motion=random:horizon=200",
@@ -179,7 +179,7 @@ def sb3_ppo(
     at_least(name, 0, score_runs=score_runs, seed=seed)
     positive(name, learning_rate=learning_rate, clip=clip)
     shares(name, gamma=gamma)
-    scene = scenario_of(scenario)
+    scene = parse_scenario(scenario)
     if scene.horizon % steps:
         raise ValueError(f"{name}: steps={steps} must divide the horizon, {scene.horizon}")
     mode = learners_mode(scene.believed, base, feedback)

@@ -14,12 +14,13 @@ from torchrl.objectives import LossModule
 
 from agents import make
 from agents.policies.adapters import LocalizerPolicy, flat, restored
+from agents.stdcl.loop import NetworkLoop
 from agents.stdcl.network import StGnn
-from agents.stdcl.stdcl import NetworkLoop
 from agents.weights import learned
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
+from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
 from training.evaluation.rollout import play
 from training.learning.augmentation import SwarmAugmentation
@@ -31,8 +32,6 @@ from training.learning.run import (
     at_least,
     make_trainer,
     positive,
-    register,
-    scenario_of,
     shares,
 )
 
@@ -146,7 +145,6 @@ def _recorded(variant: int, before: Any, after: Any, tensordict: TensorDictBase)
     return {**flat(before), "variant": torch.full(before.batch_size[:1], variant)}
 
 
-@register
 def stdcl(
     *,
     scenario: str = "swarm-v0:n_uavs=60:horizon=60",
@@ -181,7 +179,9 @@ def stdcl(
     at_least("stdcl", 0, score_runs=score_runs, seed=seed)
     positive("stdcl", learning_rate=learning_rate, last_rate=last_rate)
     shares("stdcl", smooth_from=smooth_from)
-    scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")]
+    scenes = [
+        parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
+    ]
     name = agent.split(":")[0]
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
@@ -232,7 +232,7 @@ def score(network: StGnn, agent: str, base: str, runs: int, tell: Progress) -> M
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        scene = scenario_of(f"swarm-v0:{variant}".rstrip(":"))
+        scene = parse_scenario(f"swarm-v0:{variant}".rstrip(":"))
         loop: Any = make(agent, scene)
         loop.learn(network)
         each = {}

@@ -11,13 +11,15 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.kalman.ekf import CooperativeEkf, GaussianBelief
+from agents.kalman.ekf import CooperativeEkf
+from agents.kalman.filter import GaussianBelief
 from agents.policies.adapters import LocalizerPolicy
 from agents.trust import TrustNetwork
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
+from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
 from training.evaluation.rollout import play
 from training.learning.collectors import Flights, fly, world_seed
@@ -28,8 +30,6 @@ from training.learning.run import (
     at_least,
     make_trainer,
     positive,
-    register,
-    scenario_of,
 )
 
 # What the networks meet: each alone, all at once, and nothing at all.
@@ -119,7 +119,6 @@ def _belief(entries: TensorDictBase) -> GaussianBelief:
     return GaussianBelief(**parts, batch_size=parts["step"].shape)
 
 
-@register
 def trust(
     *,
     scenario: str = "indoor-v0:horizon=100",
@@ -141,7 +140,7 @@ def trust(
     at_least("trust", 1, worlds=worlds, epochs=epochs, steps=steps)
     at_least("trust", 0, score_runs=score_runs, seed=seed)
     positive("trust", learning_rate=learning_rate)
-    scenes = [scenario_of(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
+    scenes = [parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
     network = untrained(TrustNetwork, seed)
     filters: list[Any] = [make("ekf_trust", scene, weights="none") for scene in scenes]
     for one in filters:
@@ -179,7 +178,7 @@ def score(network: TrustNetwork, base: str, runs: int, tell: Progress) -> Mappin
     if runs == 0:
         return found
     for variant in SCORED:
-        scene = scenario_of(f"{base}:horizon=300:{variant}".rstrip(":"))
+        scene = parse_scenario(f"{base}:horizon=300:{variant}".rstrip(":"))
         learned: Any = make("ekf_trust", scene, weights="none")
         learned.learn(network)
         each = {}

@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from agents.localizer import Localizer, make
+from agents.localizer import Localizer
+from agents.registry import make
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
 from training.evaluation.evaluate import Progress

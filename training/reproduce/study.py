@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.localizer import make
+from agents.registry import make
 from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
 from coloc_env.options import require_known
 from coloc_env.scenario import Scenario

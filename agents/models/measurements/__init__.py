@@ -1,7 +1,7 @@
 """Measurement models: for each sensor a team believes in, residuals and their Jacobians."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from agents.models.measurements.base import Block, Measurement, Neighbours, heard, nobody
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
@@ -21,6 +21,7 @@ from coloc_env.sensors import (
 )
 
 __all__ = [
+    "MODELS",
     "AnchorRanges",
     "Block",
     "Heights",
@@ -34,10 +35,13 @@ __all__ = [
     "UavRanges",
     "heard",
     "make_measurements",
+    "measures",
     "nobody",
 ]
 
-_MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
+_M = TypeVar("_M", bound=Callable[[Any], Measurement])
+
+MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     AnchorRanging: AnchorRanges,
     Height: Heights,
     LandmarkBearings: LandmarkRangeBearings,
@@ -48,6 +52,17 @@ _MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     UavBearings: UavRangeBearings,
 }
 _BODY_FRAME = (Landmarks, LandmarkBearings, UavBearings)
+
+
+def measures(sensor: type[Sensor]) -> Callable[[_M], _M]:
+    """Decorator of the measurement model of a sensor of one's own: built from the believed sensor,
+    and used from then on by every localizer that uses whatever has a model."""
+
+    def add(model: _M) -> _M:
+        MODELS[sensor] = model
+        return model
+
+    return add
 
 
 def make_measurements(believed: Believed) -> list[Measurement]:
@@ -62,4 +77,4 @@ def make_measurements(believed: Believed) -> list[Measurement]:
         if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled | InsDriven):
             kind = type(process).__name__
             raise ValueError(f"{name} is about velocity, which {kind} motion does not estimate")
-    return [_MODELS[type(s)](s) for s in believed.sensors if type(s) in _MODELS]
+    return [MODELS[type(s)](s) for s in believed.sensors if type(s) in MODELS]

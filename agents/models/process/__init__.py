@@ -11,7 +11,7 @@ from agents.models.process.inertial import InertialProcess
 from agents.models.process.reckoned import InsProcess, WheeledProcess
 from coloc_env import scenario as believed_processes
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Imu, Ins, Odometry
+from coloc_env.sensors import Imu, Ins, Odometry, Sensor
 
 __all__ = [
     "ConstantVelocityProcess",
@@ -19,8 +19,21 @@ __all__ = [
     "InsProcess",
     "Process",
     "WheeledProcess",
+    "drives",
     "make_process",
 ]
+
+
+_INPUTS: dict[type, type[Sensor]] = {  # what drives a motion model
+    believed_processes.Inertial: Imu,
+    believed_processes.InsDriven: Ins,
+    believed_processes.Wheeled: Odometry,
+}
+
+
+def drives(believed: Believed, sensor: Sensor) -> bool:
+    """Whether a sensor is what the believed motion model is driven by."""
+    return isinstance(sensor, _INPUTS.get(type(believed.process), ()))
 
 
 def make_process(believed: Believed) -> Process:

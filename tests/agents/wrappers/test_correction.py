@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.localizer import LOCALIZERS, Estimate, Localizer, make, register
+from agents.localizer import Estimate, Localizer
+from agents.registry import LOCALIZERS, make
 from agents.wrappers.correction import Based, Correction, with_base
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.pettingzoo import parallel_env

@@ -18,7 +18,7 @@ import coloc_env
 from coloc_env.envs.pettingzoo import CoLocParallelEnv, env, parallel_env
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import stack
-from coloc_env.scenarios import FAMILIES, make_scenario
+from coloc_env.scenarios import SCENARIOS, make_scenario
 from coloc_env.world import World
 
 INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
@@ -364,7 +364,7 @@ def test_ids_are_registered() -> None:
     assert isinstance(made, CoLocParallelEnv)
     assert made.metadata["name"] == "indoor-v0"
     assert isinstance(pettingzoo.make("aec", "coloc/indoor-v0"), pettingzoo.AECEnv)
-    for name in FAMILIES:
+    for name in SCENARIOS:
         assert f"coloc/{name}" in pettingzoo.parallel_registry
         assert f"coloc/{name}" in pettingzoo.aec_registry
 

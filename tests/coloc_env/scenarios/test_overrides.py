@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from coloc_env.observation import action_width
-from coloc_env.scenarios import make_scenario, overrides_of, parse_override
+from coloc_env.scenarios import SCENARIOS, make_scenario, parse_override
 from coloc_env.world import World
 
 # One value other than the default for every override of a family.
@@ -209,7 +209,7 @@ def told(family: str, **overrides: Any) -> tuple[Any, ...]:
 
 @pytest.mark.parametrize("family", CHANGED)
 def test_every_override_is_tried(family: str) -> None:
-    assert set(CHANGED[family]) == set(overrides_of(family))
+    assert set(CHANGED[family]) == set(SCENARIOS.options_of(family))
 
 
 @pytest.mark.parametrize(("family", "name"), EACH)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.localizer import make
+from agents.registry import make
 from coloc_env.datasets import DataError, Recording, Table, Track, data_root, load
 from coloc_env.datasets.grid import slots_on
 from coloc_env.motion import Recorded

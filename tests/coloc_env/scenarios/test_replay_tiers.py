@@ -11,7 +11,7 @@ from agents import make
 from coloc_env.datasets import DataError, Recording, data_root, load
 from coloc_env.scenario import ConstantVelocity, InsDriven, Scenario
 from coloc_env.scenarios import make_scenario
-from coloc_env.scenarios.replay_team import calibrated_pairs, ordered, true_distances
+from coloc_env.scenarios.replay_tiers import calibrated_pairs, ordered, true_distances
 from coloc_env.sensors import Ins, PositionFix, Ranging
 from coloc_env.world import World
 

@@ -11,7 +11,7 @@ import torch
 from coloc_env.motion import MOTIONS
 from coloc_env.observation import all_leaves, box, observation_space, state_bounds
 from coloc_env.scenario import ConstantVelocity, Inertial, Prior
-from coloc_env.scenarios import FAMILIES, make_scenario, overrides_of
+from coloc_env.scenarios import SCENARIOS, make_scenario
 from coloc_env.sensors import AnchorRanging, Imu, Landmarks, RangeNoise, Ranging
 from coloc_env.world import World
 
@@ -56,13 +56,13 @@ def test_unknown_scenarios_are_named() -> None:
         make_scenario("indoors-v0")
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_families_take_keywords_with_types_and_say_what_they_are(name: str) -> None:
-    family = FAMILIES[name]
+    family = SCENARIOS[name]
     kinds = {p.kind for p in inspect.signature(family).parameters.values()}
     assert kinds <= {inspect.Parameter.KEYWORD_ONLY}
     assert family.__doc__
-    for option, parameter in overrides_of(name).items():
+    for option, parameter in SCENARIOS.options_of(name).items():
         assert parameter.annotation is not inspect.Parameter.empty, option
         assert parameter.default is not inspect.Parameter.empty, option
         typing.get_args(parameter.annotation)

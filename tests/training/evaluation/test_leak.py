@@ -9,9 +9,8 @@ import torch
 
 from agents import make
 from agents.weights import card_of
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import make_scenario, parse_scenario
 from training.evaluation.rollout import play
-from training.learning.run import scenario_of
 
 POLICIES = ("mappo", "ippo", "sb3-ppo")
 _SCENARIO = {"motion": "random", "horizon": 100}
@@ -26,7 +25,7 @@ def error(agent: str, seeds: int = 8, **overrides: float) -> float:
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_shipped_policies_were_trained_where_nothing_leaks(name: str) -> None:
-    motion = scenario_of(card_of(name)["options"]["scenario"]).motion
+    motion = parse_scenario(card_of(name)["options"]["scenario"]).motion
     assert type(motion).__name__ == "RandomCircles"
 
 

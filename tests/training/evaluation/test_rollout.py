@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.localizer import make
+from agents.registry import make
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World

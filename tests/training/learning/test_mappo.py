@@ -24,6 +24,7 @@ from training.learning import mappo
 from training.learning import run as runs
 from training.learning.collectors import world_seed
 from training.learning.mappo import policy_of
+from training.learning.registry import TRAININGS
 
 SCENARIO = "indoor-v0:motion=random:horizon=10:n_uavs=3"
 SMALL: dict[str, Any] = {
@@ -60,7 +61,7 @@ def outcome(folder: Path, name: str) -> dict[str, bytes]:
 
 
 def build(name: str = "mappo", **options: Any) -> runs.Training:
-    return runs.TRAININGS[name](**SMALL | options)
+    return TRAININGS[name](**SMALL | options)
 
 
 def parts(training: runs.Training) -> tuple[Any, Any]:
@@ -115,7 +116,7 @@ def test_every_layer_moves(
 ) -> None:
     """From the weights that the training began with; what normalizes its inputs stays."""
     name, options = kind
-    begun = runs.TRAININGS[name](**options).module.state_dict()
+    begun = TRAININGS[name](**options).module.state_dict()
     file = tmp_path / "weights.safetensors"
     file.write_bytes(unbroken[f"{name}.safetensors"])
     ended = load_file(file)

@@ -20,12 +20,13 @@ from agents.policies.adapters import LocalizerPolicy
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import make_scenario, parse_scenario
 from training.evaluation.rollout import play
 from training.learning import nnhpff as training
 from training.learning import run as runs
 from training.learning.collectors import fly, world_seed
 from training.learning.nnhpff import FAILED, MAINS, VARIANTS, DetectorLoss, Samples, samples_of
+from training.learning.registry import TRAININGS
 
 # Beliefs that a filter with few particles sometimes survives.
 SMALL: dict[str, Any] = {
@@ -161,8 +162,8 @@ def test_samples_are_what_the_detector_sees_in_flight(flight: SimpleNamespace) -
 def test_an_epoch_flies_every_filter_in_every_variant_in_worlds_of_its_own() -> None:
     """Row by row: variants, in each the filters, of each the worlds."""
     mains = ["pf:particles=60", "ekf"]
-    made = runs.TRAININGS["nnhpff"](**SMALL | {"worlds": 2, "mains": "/".join(mains)})
-    scenes = [runs.scenario_of(f"wsn-v0:horizon=40:{one}") for one in SMALL["variants"].split("/")]
+    made = TRAININGS["nnhpff"](**SMALL | {"worlds": 2, "mains": "/".join(mains)})
+    scenes = [parse_scenario(f"wsn-v0:horizon=40:{one}") for one in SMALL["variants"].split("/")]
     for epoch in (0, 3):
         flight = made.flights.launch(epoch)
         (batch,) = list(flight)
@@ -186,7 +187,7 @@ def test_the_defaults_are_the_papers_27_scenarios() -> None:
     assert mains == ["pf:particles=500", "pf:particles=2000", "pf:particles=5000"]
     believed = set()
     for variant in variants:
-        scenario = runs.scenario_of(f"wsn-v0:{variant}")
+        scenario = parse_scenario(f"wsn-v0:{variant}")
         process: Any = scenario.believed.process
         sensor: Any = scenario.believed.sensors[0]
         believed.add((round(process.accel_std**2, 6), round(sensor.noise.std**2, 6)))
@@ -242,7 +243,7 @@ def test_interrupted_in_training(
 
 
 def test_figures_of_an_epoch_are_said_of_worlds_not_yet_trained_on(unbroken: Path) -> None:
-    made = runs.TRAININGS["nnhpff"](**SMALL)
+    made = TRAININGS["nnhpff"](**SMALL)
     flight = made.flights.launch(0)
     (batch,) = list(flight)
     flight.shutdown()
@@ -283,14 +284,14 @@ def test_card_and_weights(unbroken: Path) -> None:
     assert (card["epochs"], card["frames"]) == (2, 2 * 2 * 40)
     assert card["metrics"].keys() >= {"loss_detector", "held_out_loss", "accuracy", "failed_share"}
     localizer: Any = make("nnhpff", make_scenario("wsn-v0"), weights=str(weights))
-    fresh = runs.TRAININGS["nnhpff"](**SMALL).module.state_dict()
+    fresh = TRAININGS["nnhpff"](**SMALL).module.state_dict()
     trained = localizer.detector.network.state_dict()
     assert any(not torch.equal(trained[name].float(), fresh[name]) for name in fresh)
     assert all(value.isfinite().all() for value in trained.values())
 
 
 def test_scores_are_those_of_the_three_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "scenario_of", lambda text: runs.scenario_of(f"{text}:horizon=4"))
+    monkeypatch.setattr(training, "scenario_of", lambda text: parse_scenario(f"{text}:horizon=4"))
     told: list[int] = []
     detector = untrained(FailureDetector, 0)
     with torch.no_grad():

@@ -20,6 +20,7 @@ from training.evaluation.rollout import play
 from training.learning import run as runs
 from training.learning import sb3_ppo
 from training.learning.collectors import world_seed
+from training.learning.registry import TRAININGS
 from training.learning.sb3_ppo import Sb3Trainer
 
 SCENARIO = "indoor-v0:motion=random:horizon=10:n_uavs=3"
@@ -51,7 +52,7 @@ def outcome(folder: Path) -> dict[str, bytes]:
 
 
 def build(**options: Any) -> tuple[runs.Training, Sb3Trainer]:
-    training = runs.TRAININGS["sb3-ppo"](**SMALL | options)
+    training = TRAININGS["sb3-ppo"](**SMALL | options)
     trainer = training.trainer
     assert isinstance(trainer, Sb3Trainer)
     return training, trainer

@@ -28,6 +28,7 @@ from training.learning.augmentation import (
     SwarmAugmentation,
 )
 from training.learning.collectors import fly
+from training.learning.registry import TRAININGS
 from training.learning.stdcl import StDclLoss, far_off
 
 SMALL: dict[str, Any] = {
@@ -243,7 +244,7 @@ def test_interrupted_in_training(
 
 
 def test_the_two_stages_and_the_cosine() -> None:
-    made = runs.TRAININGS["stdcl"](**{**SMALL, "epochs": 11, "smooth_from": 0.5})
+    made = TRAININGS["stdcl"](**{**SMALL, "epochs": 11, "smooth_from": 0.5})
     loss: Any = made.trainer.loss_module
     for epoch, share, smooth in ((0, 1.0, False), (5, 0.5, False), (6, 0.345, True), (10, 0, True)):
         made.flights.launch(epoch).shutdown()

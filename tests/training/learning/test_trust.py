@@ -22,6 +22,7 @@ from coloc_env.scenarios import make_scenario
 from training.learning import run as runs
 from training.learning import trust as training
 from training.learning.collectors import fly
+from training.learning.registry import TRAININGS
 from training.learning.trust import TrustLoss, negative_log_likelihood
 
 SMALL = {
@@ -173,7 +174,7 @@ def test_an_epoch_flies_every_variant_in_worlds_of_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(training, "VARIANTS", VARIANTS)
-    made = runs.TRAININGS["trust"](**SMALL)
+    made = TRAININGS["trust"](**SMALL)
     optimizer = made.trainer.optimizer
     priors = set()
     for epoch, share in ((0, 1.0), (1, 0.05)):
@@ -255,7 +256,7 @@ def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
     localizer: Any = make("ekf_trust", make_scenario("indoor-v0"), weights=str(weights))
     assert isinstance(localizer.screen, TrustScreen)
-    fresh = runs.TRAININGS["trust"](**options).module.state_dict()
+    fresh = TRAININGS["trust"](**options).module.state_dict()
     trained = localizer.screen.network.state_dict()
     assert any(not torch.equal(trained[name], fresh[name]) for name in fresh)
     assert all(value.isfinite().all() for value in trained.values())

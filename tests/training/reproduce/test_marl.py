@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coloc_env.scenarios import parse_scenario
 from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
-from training.learning.run import TRAININGS, options_of, scenario_of
+from training.learning.registry import TRAININGS
 from training.reproduce.marl import plan, report, run
 from training.reproduce.marl.plan import Goal, Trained
 from training.reproduce.marl.report import Figures
@@ -26,15 +27,15 @@ def test_every_training_exists_and_stays_within_its_budget() -> None:
     keys = [one.key for one in plan.trainings()]
     assert len(set(keys)) == len(keys)
     for one in plan.trainings():
-        known = options_of(one.name)
+        known = TRAININGS.options_of(one.name)
         chosen = {key: p.default for key, p in known.items()} | dict(one.options)
         assert set(chosen) == set(known)
-        scene = scenario_of(str(chosen["scenario"]))
+        scene = parse_scenario(str(chosen["scenario"]))
         assert scene.motion.__class__.__name__ == "RandomCircles"
         steps = chosen["worlds"] * chosen["epochs"] * scene.horizon * scene.arena.n_uavs
         assert steps <= 3e6
         for each in str(chosen["variants"]).split("/"):
-            scenario_of(f"{chosen['scenario']}:{each}".strip(":"))
+            parse_scenario(f"{chosen['scenario']}:{each}".strip(":"))
 
 
 def test_goals_are_about_policies_that_are_tried_there() -> None:

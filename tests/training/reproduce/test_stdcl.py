@@ -10,7 +10,7 @@ import torch
 from typer.testing import CliRunner
 
 from agents import make
-from agents.localizer import LOCALIZERS
+from agents.registry import LOCALIZERS
 from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
 from coloc_env.scenarios import make_scenario
 from training.cli.command import app

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from agents.localizer import Localizer, make
+from agents.localizer import Localizer
+from agents.registry import make
 from coloc_env.scenarios import make_scenario
 from training.reproduce import identity
 from training.reproduce.store import Store

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from agents.localizer import make
+from agents.registry import make
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
 from training.learning.pfnn_online import learn_in_flight

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents.localizer import make
+from agents.registry import make
 from coloc_env.options import require_known
 from coloc_env.staging import staged_folder
 from training.evaluation.evaluate import Progress

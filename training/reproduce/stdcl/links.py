@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from agents.localizer import Localizer, make
+from agents.localizer import Localizer
+from agents.registry import make
 from agents.swarm.filter import SwarmFilter
 from coloc_env.geometry.walls import depth
 from coloc_env.world import World

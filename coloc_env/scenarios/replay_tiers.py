@@ -11,7 +11,6 @@ from coloc_env.datasets.recording import Floats
 from coloc_env.datasets.replay import arena_of, recorded_motion, recorded_ranges
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, InsDriven, Prior, Process, Scenario
-from coloc_env.scenarios.registry import register
 from coloc_env.scenarios.replay import cut, loaded
 from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging, Sensor
 
@@ -64,7 +63,6 @@ def calibrated_pairs(recording: Recording, seconds: float) -> Recording:
     return replace(recording, streams={"uav_ranges": tuple(tables)})
 
 
-@register("replay-tiers-v0")
 def replay_tiers(
     *,
     sequence: str | None = None,

@@ -5,12 +5,10 @@ from coloc_env.datasets.grid import common_grid
 from coloc_env.datasets.replay import arena_of, recorded_imu_samples, recorded_motion
 from coloc_env.network import Network
 from coloc_env.scenario import Inertial, Prior, Scenario
-from coloc_env.scenarios.registry import register
 from coloc_env.scenarios.replay import LEFT_OVER, cut, euroc_bias, loaded
 from coloc_env.sensors import Imu, Landmarks
 
 
-@register("replay-stein-euroc-v0")
 def replay_stein_euroc(
     *,
     sequence: str = "V1_01_easy",

@@ -1,0 +1,129 @@
+"""What Kalman filters have in common: a Gaussian belief on the manifold, and its prediction."""
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.localizer import Estimate, Localizer
+from agents.models.process import Process, make_process
+from agents.robust import Prediction
+from agents.tensorclasses import build
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+
+# Weights tried by covariance intersection.
+_OMEGA = (1.0, 0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)
+
+
+class GaussianBelief(TensorClass):
+    """Mean state, error covariance (float64), steps taken, and what a screen remembers of earlier
+    measurements; batch (B, N)."""
+
+    state: Float[Tensor, "B N S"]
+    covariance: Float[Tensor, "B N E F"]
+    step: Int64[Tensor, "B N"]
+    memory: Float[Tensor, "B N K"]
+
+    def moved(self, offset: Float[Tensor, "B N d"]) -> "GaussianBelief":
+        """Its position shifted by ``offset`` (m)."""
+        d = offset.shape[-1]
+        return self.replace(
+            state=torch.cat((self.state[..., :d] + offset, self.state[..., d:]), -1)
+        )
+
+
+def elapsed(process: Process, step: Int64[Tensor, "B N"]) -> Float[Tensor, "B N"]:
+    """Seconds since the belief's step: none before the first observation."""
+    return (step > 0) * process.dt
+
+
+def predict(
+    process: Process, belief: GaussianBelief, observation: Observation
+) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+    """Mean and covariance at the observation's step, before its measurements are used."""
+    dt = elapsed(process, belief.step).double()
+    u = process.inputs(observation)
+    f, q = process.linearize(belief.state, u, dt)
+    return process.propagate(belief.state, u, dt), f @ belief.covariance @ f.mT + q
+
+
+def gaussian_estimate(
+    process: Process, x: Float[Tensor, "B N S"], covariance: Float[Tensor, "B N E E"]
+) -> Estimate:
+    """What a Gaussian belief says of position and velocity."""
+    d = process.dim
+    return build(
+        Estimate,
+        x.shape[:2],
+        position=x[..., :d],
+        velocity=x[..., d : 2 * d],
+        covariance=covariance[..., :d, :d],
+    )
+
+
+class GaussianFilter(Localizer[GaussianBelief]):
+    """A Kalman filter for each UAV: prediction by the motion model, then ``update``."""
+
+    def __init__(self, believed: Believed) -> None:
+        super().__init__(believed)
+        self.process = make_process(believed)
+
+    def reset(self, observation: Observation) -> GaussianBelief:
+        x, covariance = self.process.initial(observation["prior"].double())
+        return GaussianBelief(
+            state=x,
+            covariance=covariance,
+            step=torch.zeros(x.shape[:2], dtype=torch.int64, device=x.device),
+            memory=self.memory(observation),
+            batch_size=x.shape[:2],
+        )
+
+    def step(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[GaussianBelief, Estimate]:
+        x, covariance = predict(self.process, belief, observation)
+        prior = Prediction(x, covariance, observation, belief.memory)
+        x, covariance, memory = self.update(prior)
+        after = build(
+            GaussianBelief,
+            x.shape[:2],
+            state=x,
+            covariance=covariance,
+            step=belief.step + 1,
+            memory=memory,
+        )
+        return after, gaussian_estimate(self.process, x, covariance)
+
+    def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
+        return belief.state
+
+    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.moved(offset)
+
+    def gaussian(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        return belief.state, belief.covariance
+
+    def restarted(
+        self,
+        belief: GaussianBelief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> GaussianBelief:
+        return belief.replace(
+            state=torch.where(rows.unsqueeze(-1), state, belief.state),
+            covariance=torch.where(rows[..., None, None], covariance, belief.covariance),
+        )
+
+    def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
+        """What is remembered of measurements before the first: nothing."""
+        return observation["prior"][..., :0]
+
+    def update(
+        self, prior: Prediction
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
+        """Use the observation's measurements: none here."""
+        return prior.state, prior.covariance, prior.memory

@@ -1,0 +1,27 @@
+"""The particle filter that adapts its number of particles (PF-NN paper, equation 17, Algorithm
+2)."""
+
+from typing import Any
+
+from agents.particle.filter import ParticleFilter
+from coloc_env.scenario import Believed
+
+
+class AdaptiveParticleFilter(ParticleFilter):
+    """SIR particle filter that adapts its number of particles (PF-NN paper, without network).
+
+    It starts with ``particles`` and stays within ``bounds``: 100 more where the effective sample
+    size falls below 0.3 of the count, 50 fewer where it exceeds 0.8.
+    """
+
+    name = "apf"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        particles: int = 300,
+        bounds: tuple[int, int] | None = (100, 800),
+        **options: Any,
+    ) -> None:
+        super().__init__(believed, particles=particles, bounds=bounds, **options)

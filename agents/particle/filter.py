@@ -1,0 +1,258 @@
+"""SIR particle filters with Liu-West regularization and adaptive tempering, one per UAV.
+
+Gordon, Salmond & Smith 1993; resampling when the effective sample size falls below half.
+Neighbours' messages enter as ranges whose variance is inflated by the sender's own uncertainty.
+Particles live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper,
+Algorithms 1 and 2).
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from torch import Tensor
+
+from agents.kalman.filter import elapsed
+from agents.localizer import Estimate, Localizer
+from agents.models.measurements import heard, make_measurements, nobody
+from agents.models.process import make_process
+from agents.particle import particle_count, sampling
+from agents.particle.belief import ParticleBelief, Step, normal, own_keys
+from agents.particle.cloud import Moments, moments, select
+from agents.particle.degeneracy import Remedy, degenerate
+from agents.particle.likelihood import log_likelihood
+from agents.particle.proposal import guided, proposed
+from agents.particle.resampling import FLOOR, Perturb, Renewal, padded, padded_weights
+from agents.robust import RobustScreen, Screen, Trust
+from agents.tensorclasses import build
+from coloc_env import noise
+from coloc_env.observation import Observation
+from coloc_env.scenario import Believed
+
+Proposal = Literal["prior", "ekf"]
+
+
+class ParticleFilter(Localizer[ParticleBelief]):
+    """Bootstrap filter; its number of particles is fixed unless ``bounds`` let it adapt.
+
+    ``perturb``: ``liu_west`` moves resampled particles so that the cloud keeps its moments, above a
+    small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). A likelihood that leaves
+    few particles is used in stages in the first steps; later, particles are drawn anew from 1.1 ×
+    an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003) if
+    enough survive those; ``proposal=ekf`` does so at every step.
+    ``tempering=false`` uses every likelihood as it comes.
+    ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
+    ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
+    and needs a C++ compiler); the numbers then differ in their last digits.
+    """
+
+    name = "pf"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        particles: int,
+        bounds: tuple[int, int] | None = None,
+        seed: int = 0,
+        perturb: Perturb = "liu_west",
+        tempering: bool = True,
+        proposal: Proposal = "prior",
+        robust: str = "none",
+        gate: float = 0.999,
+        cooperate: bool = True,
+        compile: bool = False,
+    ) -> None:
+        super().__init__(believed)
+        if particles < 10:
+            raise ValueError(f"particles={particles} is not allowed: at least 10")
+        if bounds is not None and not 10 <= bounds[0] <= particles <= bounds[1]:
+            raise ValueError(
+                f"bounds={bounds} is not allowed: low,high with 10 ≤ low ≤ particles ({particles}) "
+                "≤ high"
+            )
+        self.particles, self.seed, self.tempering = particles, seed, tempering
+        self.bounds, self.proposal = bounds, proposal
+        self.capacity = particles if bounds is None else bounds[1]
+        self.process = make_process(believed)
+        self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
+        self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        self.renewal = Renewal(self.process, perturb, bounds)
+        self.compiled = compile
+        if compile:
+            self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
+            self.renewal.weigh = torch.compile(self.renewal.weigh, dynamic=False)  # type: ignore[method-assign]
+            self.renewal.renew = torch.compile(self.renewal.renew, dynamic=False)  # type: ignore[method-assign]
+
+    @property
+    def exchanges(self) -> bool:
+        return self.screen.exchanges
+
+    def reset(self, observation: Observation) -> ParticleBelief:
+        prior = observation["prior"]
+        mean, covariance = self.process.initial(prior)
+        key = own_keys(observation, self.seed)
+        m = self.capacity
+        particles = sampling.from_prior(self.process, self.believed, mean, covariance, key, m)
+        count = torch.full_like(key, self.particles)
+        live = particle_count.alive(count, m)
+        return ParticleBelief(
+            particles=torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2)),
+            log_weights=particle_count.equal_log_weights(live),
+            count=count,
+            key=key,
+            step=torch.zeros_like(key),
+            ess_share=torch.ones_like(prior[..., 0]),
+            last=mean[..., : 2 * self.process.dim],
+            memory=self.screen.memory(observation),
+            batch_size=key.shape,
+        )
+
+    def step(
+        self, belief: ParticleBelief, observation: Observation
+    ) -> tuple[ParticleBelief, Estimate]:
+        key, neighbours = (
+            noise.fold(belief.key, belief.step),
+            nobody(belief.last[..., : self.process.dim]),
+        )
+        if any(model.cooperative for model in self.models):
+            neighbours = heard(self.believed, observation)
+        now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
+        particles, log_weights, memory = self._updated(now)
+        weighed = self.renewal.weigh(particles, log_weights, belief.count)
+        particles, log_weights = self.renewal.renewed(particles, weighed, belief.count, key)
+        mean = weighed.cloud.mean
+        after = build(
+            ParticleBelief,
+            key.shape,
+            particles=padded(particles, mean, self.capacity),
+            log_weights=padded_weights(log_weights, self.capacity),
+            count=weighed.target,
+            key=belief.key,
+            step=belief.step + 1,
+            ess_share=weighed.ess / belief.count,
+            last=mean[..., : 2 * self.process.dim],
+            memory=memory,
+        )
+        return after, self._estimate(weighed.cloud)
+
+    def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
+        return moments(self.process, belief.particles, belief.log_weights.exp()).mean
+
+    def moved(self, belief: ParticleBelief, offset: Float[Tensor, "B N d"]) -> ParticleBelief:
+        return belief.moved(offset)
+
+    def restarted(
+        self,
+        belief: ParticleBelief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> ParticleBelief:
+        key, like = noise.fold(belief.key, belief.step), belief.particles
+        draws = normal(key, "pf.restart", self.process.error_size, self.capacity)
+        drawn = sampling.gaussian(self.process, state, covariance, draws)
+        state = state.to(like.dtype)
+        count = torch.where(rows, self.particles, belief.count)
+        live = particle_count.alive(count, self.capacity)
+        drawn = torch.where(live.unsqueeze(-1), drawn, state.unsqueeze(-2))
+        row = rows.unsqueeze(-1)
+        return belief.replace(
+            particles=torch.where(row.unsqueeze(-1), drawn, like),
+            log_weights=torch.where(
+                row, particle_count.equal_log_weights(live), belief.log_weights
+            ),
+            count=count,
+            last=torch.where(row, state[..., : 2 * self.process.dim], belief.last),
+        )
+
+    def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
+        return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
+
+    def log_correction(
+        self, particles: Float32[Tensor, "B N M S"], belief: ParticleBelief
+    ) -> Float32[Tensor, "B N M"] | None:
+        """What a learned part adds to the log-likelihood of particles: nothing here."""
+        return None
+
+    def _slots(self, count: Int64[Tensor, "B N"]) -> int:
+        """How many slots the step works on: enough for any UAV of the batch to grow into; all of
+        them where each number would be compiled for."""
+        if self.bounds is None or self.compiled:
+            return self.capacity
+        return min(self.capacity, int(count.max()) + particle_count.GROW)
+
+    def _updated(
+        self, now: Step
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Float[Tensor, "B N K"]]:
+        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
+        normalized), and what the screen remembers."""
+        belief = now.belief
+        slots = self._slots(belief.count)
+        particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
+        draws = normal(now.key, "pf.step", self.process.noise_size, slots)
+        u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
+        dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
+        guide, memory = None, belief.memory
+        if self.models and (self.screen.judges or self.proposal == "ekf"):
+            particles = self.process.propagate(particles, u, dt, draws)
+            guide = guided(self.screen, self.renewal.floor, particles, log_weights, now)
+            now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
+            if self.proposal == "ekf":
+                particles, log_weights = proposed(self.process, guide, now, slots)
+            gain = self._evidence(particles, log_weights, now)
+            few = self._degenerate(log_weights + gain, now)
+        else:
+            particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
+        if not (self.models and bool(few.any())):
+            return particles, log_weights + gain, memory
+        remedy = Remedy(partial(self._evidence, now=now), self.screen, self.renewal, now)
+        return *remedy.mended(particles, log_weights, gain, few, guide), memory
+
+    def _foresee(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        u: Float32[Tensor, "B N 1 U"],
+        dt: Float32[Tensor, "B N 1"],
+        draws: Float32[Tensor, "B N M W"],
+        now: Step,
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
+        """Each particle moves with its own draw of the motion's noise, and meets the evidence;
+        whether that leaves too few."""
+        particles = self.process.propagate(particles, u, dt, draws)
+        gain = self._evidence(particles, log_weights, now)
+        return particles, gain, self._degenerate(log_weights + gain, now)
+
+    def _degenerate(self, log_weights: Float32[Tensor, "B N M"], now: Step) -> Bool[Tensor, "B N"]:
+        """Whose weights are those of too few particles, which tempering would mend."""
+        if not self.tempering:
+            return torch.zeros_like(log_weights[..., 0], dtype=torch.bool)
+        return degenerate(log_weights, now.belief)
+
+    def _evidence(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        now: Step,
+    ) -> Float32[Tensor, "B N M"]:
+        """What the step says of each particle: log-likelihood and learned correction."""
+        centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
+        evidence = now.observation, now.neighbours, now.trusts
+        gain = log_likelihood(self.models, self.process, particles, centre, *evidence)
+        correction = self.log_correction(particles, now.belief)
+        return gain if correction is None else gain + correction
+
+    def _estimate(self, cloud: Moments) -> Estimate:
+        """The weighted cloud's mean, never surer of the position than the floor."""
+        d, covariance = self.process.dim, cloud.covariance
+        least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
+        return build(
+            Estimate,
+            cloud.mean.shape[:2],
+            position=cloud.mean[..., :d],
+            velocity=cloud.mean[..., d : 2 * d],
+            covariance=covariance[..., :d, :d] + least,
+        )

@@ -1,0 +1,33 @@
+"""Hybrid filters: a main one, a detector of its failure, and an auxiliary one to restart it from.
+
+NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filter.
+"""
+
+from agents.particle.failure import FailureDetector, NeuralDetector
+from agents.particle.hybrid import HybridFilter
+from agents.weights import learned
+from coloc_env.scenario import Believed
+
+
+class NeuralHpff(HybridFilter):
+    """Hybrid particle/FIR filter: a failure is what a 5–10–5–2 network gives a probability above
+    ``threshold``. ``weights``: a checkpoint's name or path, or ``none``."""
+
+    name = "nnhpff"
+
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        main: str = "pf",
+        auxiliary: str = "emvf",
+        weights: str = "nnhpff",
+        threshold: float = 0.5,
+        patience: int = 1,
+    ) -> None:
+        network = learned(FailureDetector, weights).requires_grad_(False)
+        super().__init__(believed, NeuralDetector(network), main, auxiliary, threshold, patience)
+
+    def learn(self, network: FailureDetector) -> None:
+        """Judge by this network from now on."""
+        self.detector = NeuralDetector(network)

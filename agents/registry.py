@@ -1,0 +1,114 @@
+"""Localizers by name: what exists, which options each takes, and building one for a scenario."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+from coloc_env import options
+from coloc_env.registry import Factory, Registry
+
+if TYPE_CHECKING:
+    from agents.localizer import Localizer
+    from coloc_env.scenario import Believed, Scenario
+
+LOCALIZERS = Registry(
+    "agent",
+    "coloc.localizers",
+    {
+        "apf": "agents.particle.apf:AdaptiveParticleFilter",
+        "cspf": "agents.stein.cspf:SteinFilter",
+        "dead_reckoning": "agents.kalman.dead_reckoning:DeadReckoning",
+        "dwmds": "agents.swarm.dwmds:CostaMds",
+        "dwmds_st": "agents.swarm.dwmds_st:DynamicMds",
+        "ekf": "agents.kalman.ekf:CooperativeEkf",
+        "ekf_joint": "agents.kalman.ekf_joint:JointEkf",
+        "ekf_trust": "agents.trust.ekf_trust:TrustingEkf",
+        "emvf": "agents.kalman.emvf:MinimumVarianceFir",
+        "fcmds": "agents.swarm.fcmds:FullyConnectedMds",
+        "gn": "agents.swarm.gn:Snapshot",
+        "hpff": "agents.particle.hpff:Hpff",
+        "ippo": "agents.policies.ippo:Ippo",
+        "map": "agents.swarm.map:RecursiveMap",
+        "mappo": "agents.policies.mappo:Mappo",
+        "mds": "agents.swarm.mds:MdsMap",
+        "nnhpff": "agents.particle.nnhpff:NeuralHpff",
+        "pf": "agents.particle.pf:Pf",
+        "pf500": "agents.particle.pf:Pf500",
+        "pf800": "agents.particle.pf:Pf800",
+        "pf_joint": "agents.particle.pf_joint:TeamParticleFilter",
+        "pf_trust": "agents.trust.pf_trust:TrustingParticleFilter",
+        "pfnn": "agents.particle.pfnn:NeuralParticleFilter",
+        "pose_graph": "agents.factor_graph.pose_graph:PoseGraph",
+        "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
+        "stdcl": "agents.stdcl.stdcl:StDcl",
+        "stein_vi": "agents.stein.stein_vi:SteinViFilter",
+        "stgat": "agents.stdcl.stgat:StGat",
+        "vmds": "agents.swarm.vmds:VelocityMds",
+    },
+)
+
+
+def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
+    """Build a localizer for what the scenario's team believes (or for those beliefs).
+
+    ``name`` may carry options as on the command line (``"ekf:robust=huber"``). Raises ValueError,
+    in one line that names what is allowed, for an unknown name or option, and for a team that
+    measures what the localizer would ignore.
+    """
+    name, *texts = name.split(":")
+    factory = LOCALIZERS.require(name)
+    known = options.of(factory)
+    for text in texts:
+        key, value = options.parse(name, text, known)
+        if key in chosen:
+            raise ValueError(f"{name}: {key} is given twice")
+        chosen[key] = value
+    chosen = options.checked(name, chosen, known)
+    believed: Believed = getattr(scenario, "believed", scenario)  # type: ignore[arg-type]
+    _require_served(name, factory, believed)
+    build = getattr(factory, "suited", factory)
+    try:
+        made: Localizer = build(believed, **options.grouped(factory, chosen))
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
+    return made
+
+
+def _require_served(name: str, factory: Factory, believed: Believed) -> None:
+    """Raise ValueError if a localizer would ignore what the team measures; name those that fit.
+
+    One that uses whatever has a measurement model goes on without a sensor that has none, as long
+    as something is left to use, and warns of it.
+    """
+    from agents.models.measurements import MODELS
+
+    ignored = _ignored(factory, believed)
+    if not ignored:
+        return
+    measuring = [sensor for sensor in believed.sensors if sensor.informs]
+    general = getattr(factory, "serves", None) is None
+    if general and any(type(sensor) in MODELS for sensor in measuring):
+        warnings.warn(
+            f"{name}: {', '.join(ignored)} has no measurement model and is not used "
+            "(agents.models.measurements.measures registers one)",
+            stacklevel=3,
+        )
+    else:
+        others = [one for one in LOCALIZERS if not _ignored(LOCALIZERS[one], believed)]
+        raise ValueError(
+            f"{name}: what the team measures with {', '.join(ignored)} would be ignored; "
+            f"these use it: {', '.join(others) or 'none'}"
+        )
+
+
+def _ignored(factory: Factory, believed: Believed) -> list[str]:
+    ignores = getattr(factory, "ignores", None)
+    return [] if ignores is None else ignores(believed)
+
+
+def _uses_all(factory: Factory, believed: Believed) -> bool:
+    from coloc_env.sensors import Sensor
+
+    return not _ignored(factory, believed) and getattr(factory, "serves", None) != (Sensor,)

@@ -1,0 +1,17 @@
+"""Trainings by name: what can be learned, and with which options."""
+
+from coloc_env.registry import Registry
+
+TRAININGS = Registry(
+    "training",
+    "coloc.trainings",
+    {
+        "ippo": "training.learning.mappo:ippo",
+        "mappo": "training.learning.mappo:mappo",
+        "nnhpff": "training.learning.nnhpff:nnhpff",
+        "pfnn": "training.learning.pfnn:pfnn",
+        "sb3-ppo": "training.learning.sb3_ppo:sb3_ppo",
+        "stdcl": "training.learning.stdcl:stdcl",
+        "trust": "training.learning.trust:trust",
+    },
+)
