@@ -17,12 +17,12 @@ PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pfnn_trust")
 REST = "rest"
 _STEPS, _WARM_UP = 200, 20
 _FUNCTIONS = {  # where a name is looked up: what its time is called
-    "agents.particle.pf.normal": "noise",
+    "agents.particle.filter.normal": "noise",
     "agents.particle.resampling.normal": "noise",
     "agents.particle.proposal.normal": "noise",
     "agents.particle.tempering.normal": "noise",
-    "agents.particle.pf.heard": "messages",
-    "agents.particle.pf.log_likelihood": "likelihood",
+    "agents.particle.filter.heard": "messages",
+    "agents.particle.filter.log_likelihood": "likelihood",
     "agents.particle.resampling.moments": "moments",
     "agents.particle.proposal.moments": "moments",
     "agents.particle.tempering.moments": "moments",
@@ -34,10 +34,10 @@ _FUNCTIONS = {  # where a name is looked up: what its time is called
     "agents.particle.tempering.normalized": "weights",
     "agents.particle.tempering.effective_sample_size": "weights",
     "agents.particle.proposal.iterated_update": "Gaussian update",
-    "agents.particle.pf.proposed": "proposal",
+    "agents.particle.filter.proposed": "proposal",
     "agents.particle.degeneracy.proposed": "proposal",
     "agents.kalman.ekf.heard": "messages",
-    "agents.kalman.ekf.predict": "prediction",
+    "agents.kalman.filter.predict": "prediction",
     "agents.models.update.information": "information",
     "agents.models.update.posterior": "information",
     "agents.trust.screen.innovation": "trust features",
