@@ -11,9 +11,9 @@ import torch
 
 from agents import Localizer
 from coloc_env.scenario import Scenario
-from coloc_env.world import World
+from training.evaluation.rollout import rollout
 
-PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pfnn_trust")
+PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pf_trust")
 REST = "rest"
 _STEPS, _WARM_UP = 200, 20
 _FUNCTIONS = {  # where a name is looked up: what its time is called
@@ -77,20 +77,16 @@ class Stopwatch:
         return call
 
 
-@torch.no_grad()
 def step_parts(localizer: Localizer, scenario: Scenario) -> dict[str, float]:
     """Mean ms of each part of the whole team's step in one world; ``rest`` is what no part is."""
-    world, watch = World(scenario), Stopwatch()
-    observation = world.reset(0)
-    belief = localizer.reset(observation)
-    step = watch.watched(REST, localizer.step)
-    with _watching(localizer, watch):
-        for k in range(_WARM_UP + _STEPS):
-            if k == _WARM_UP:
+    watch = Stopwatch()
+    with (
+        _watching(localizer, watch),
+        patch.object(localizer, "step", watch.watched(REST, localizer.step)),
+    ):
+        for step in rollout(localizer, scenario, torch.tensor([0]), _WARM_UP + _STEPS):
+            if step.k == _WARM_UP - 1:
                 watch.seconds.clear()
-            belief, estimate = step(belief, observation)
-            world.advance(estimate.action())
-            observation = world.observation()
     ordered = sorted(watch.seconds.items(), key=lambda item: (item[0] == REST, -item[1]))
     return {part: 1e3 * seconds / _STEPS for part, seconds in ordered}
 
