@@ -140,7 +140,7 @@ def test_diverged_runs_are_counted_and_kept() -> None:
     assert lost == [False, True, False, False]
     assert [figures[name]["diverged_runs"] for name in names] == [0, 3, 3, 3]
     assert figures[names[3]]["diagnostics"]["raised_runs"] == 3
-    assert results.agents[names[3]].message == "step 59: RuntimeError: the matrix is singular"
+    assert results.agents[names[3]].messages[0] == "step 59: RuntimeError: the matrix is singular"
     for name in names:
         assert results.agents[name].error.shape == (3, 60, 3)
         assert math.isfinite(figures[name]["rmse"])
