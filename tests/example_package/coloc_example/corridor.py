@@ -11,8 +11,12 @@ def corridor(
     *, n_uavs: PositiveCount = 3, length: PositiveMetres = 40.0, horizon: PositiveCount = 100
 ) -> Scenario:
     """UAVs in a corridor of 4 m by 3 m, with two anchors every 10 m."""
-    stations = range(0, int(length) + 1, 10)
-    places = tuple((float(x), y, z) for x in stations for y, z in ((0.0, 0.0), (4.0, 3.0)))
+    low_high = ((0.0, 3.0), (3.0, 0.0))  # by turns: anchors in one plane leave a mirror image
+    places = tuple(
+        (10.0 * i, y, z)
+        for i in range(int(length) // 10 + 1)
+        for y, z in zip((0.0, 4.0), low_high[i % 2], strict=True)
+    )
     sensors = (AnchorRanging(places, RangeNoise(std=0.1)),)
     return Scenario(
         name="corridor-v0",
