@@ -315,7 +315,7 @@ def test_flights_that_do_not_fit_are_refused(motion: Motion, words: str) -> None
 def test_the_campus_is_as_documented() -> None:
     scenario = make_scenario("campus-v0")
     arena = scenario.arena
-    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.guides) == (10, 0.1, 1000, 3)
+    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.anchor_uavs) == (10, 0.1, 1000, 3)
     assert [make_scenario("campus-v0", flight=f).horizon for f in FLIGHTS] == [1200, 1000, 9000]
     assert scenario.network.radius == 400.0
     assert scenario.network.walls == (BUILDING,)

@@ -22,7 +22,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "landmark_radius": 4.0,
         "false_matches": 0.5,
         "landmark_dropout": 0.5,
-        "range_only": (0.0, 1.0),
+        "landmarks_off": (0.0, 1.0),
         "uwb": False,
         "uwb_std": 0.7,
         "nlos": 0.5,
@@ -81,7 +81,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "v_max": 100.0,
         "dt": 0.5,
         "horizon": 17,
-        "anchors": 0.6,
+        "anchor_share": 0.6,
         "anchor_std": 2.0,
         "uwb_std": 5.0,
         "nlos": 0.5,
@@ -107,7 +107,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "n_uavs": 7,
         "dt": 0.05,
         "horizon": 17,
-        "anchors": 0.6,
+        "anchor_share": 0.6,
         "anchor_std": 2.0,
         "uwb_std": 5.0,
         "believed_uwb_std": 0.5,
@@ -189,7 +189,7 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
     "stein2d-v0": {"failure_rate": {"horizon": 4}},
     "stein3d-v0": {"failure_rate": {"horizon": 4}},
 }
-SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchors": 0.3, "nlos": 0.4}}
+SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.3, "nlos": 0.4}}
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
 
 

@@ -11,10 +11,10 @@ import torch
 from agents.registry import make
 from coloc_env.datasets import DataError, Recording, Table, Track, data_root, load
 from coloc_env.datasets.grid import slots_on
-from coloc_env.motion import Recorded
+from coloc_env.motion import RecordedMotion
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
-from coloc_env.scenarios.replay_anchors import corrected, ranging_grid
+from coloc_env.scenarios.parts.tag_replays import corrected, ranging_grid
 from coloc_env.sensors import AnchorRanging, Odometry
 from coloc_env.world import World
 
@@ -63,7 +63,7 @@ def leaves(made: Scenario) -> dict[str, torch.Tensor]:
 
 def rmse(made: Scenario, agent: str, runs: int = 3, after: int = 0) -> float:
     """Over the steps with truth from ``after`` on, in m."""
-    assert isinstance(made.motion, Recorded)
+    assert isinstance(made.motion, RecordedMotion)
     assert made.motion.valid is not None
     localizer, world = make(agent, made), World(made, runs)
     observation, squared = world.reset(0), []

@@ -24,7 +24,7 @@ from coloc_env.world import World
 MOTIONS = ["random", "line", "circle", "helix", "weave"]
 TROUBLE: dict[str, Any] = {
     "n_uavs": 10,
-    "anchors": 0.3,
+    "anchor_share": 0.3,
     "layout": "u",
     "nlos": 0.3,
     "nlos_time": 4.0,
@@ -42,7 +42,7 @@ TROUBLE: dict[str, Any] = {
 def test_the_swarm_is_the_papers() -> None:
     scenario = make_scenario("swarm-v0")
     arena = scenario.arena
-    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.guides) == (200, 1.0, 100, 30)
+    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.anchor_uavs) == (200, 1.0, 100, 30)
     assert (arena.low, arena.high) == ((0.0, 0.0, 0.0), (10e3, 10e3, 5e3))
     assert scenario.network.radius == 5e3
     assert scenario.prior.position_std == 50.0
@@ -67,8 +67,8 @@ def test_the_swarm_is_the_papers() -> None:
 
 
 def test_without_anchors_nobody_has_a_fix() -> None:
-    scenario = make_scenario("swarm-v0", anchors=0.0)
-    assert scenario.guides == 0
+    scenario = make_scenario("swarm-v0", anchor_share=0.0)
+    assert scenario.anchor_uavs == 0
     assert "position_fix" not in all_leaves(scenario)
 
 
@@ -194,7 +194,7 @@ def test_guides_are_spread_over_the_groups_of_a_weave() -> None:
 
 
 def test_guides_know_where_they_are_and_are_not_scored() -> None:
-    world = World(make_scenario("swarm-v0", n_uavs=10, anchors=0.3), 50)
+    world = World(make_scenario("swarm-v0", n_uavs=10, anchor_share=0.3), 50)
     seen = world.reset(0)
     mask = seen["position_fix_mask"][..., 0]
     assert torch.equal(mask, (torch.arange(10) < 3).float().expand(50, 10))
@@ -210,7 +210,7 @@ def test_guides_know_where_they_are_and_are_not_scored() -> None:
 
 @pytest.mark.parametrize("reward", REWARDS)
 def test_guides_earn_nothing_and_say_so(reward: str) -> None:
-    env = parallel_env("swarm-v0", n_uavs=4, anchors=0.5, horizon=3, reward=reward)
+    env = parallel_env("swarm-v0", n_uavs=4, anchor_share=0.5, horizon=3, reward=reward)
     _, infos = env.reset(seed=0)
     assert {info["scored"] for info in infos.values()} == {0.0}
     still = {agent: np.zeros(9, np.float32) for agent in env.agents}
@@ -225,7 +225,7 @@ def test_guides_earn_nothing_and_say_so(reward: str) -> None:
 
 
 def test_the_bound_is_that_of_those_who_are_scored() -> None:
-    bound = posterior_bound(make_scenario("swarm-v0", n_uavs=6, anchors=0.5), 2, steps=5)
+    bound = posterior_bound(make_scenario("swarm-v0", n_uavs=6, anchor_share=0.5), 2, steps=5)
     assert torch.equal(bound.scored, (torch.arange(6) >= 3).expand(2, 5, 6))
     assert bound.mse[..., :3].max() < 3 * 0.1**2 + 1e-9
     assert bound.mse[..., 3:].min() > 3 * 0.1**2
@@ -254,7 +254,7 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
         ),
         ({"anchors": 1.0}, r"anchors=1.0 is not allowed: a share in \[0, 1\)"),
         ({"anchors": -0.1}, r"anchors=-0.1 is not allowed: a share in \[0, 1\)"),
-        ({"anchors": 0.9, "n_uavs": 3}, "guides=3 is not allowed: from 0 to fewer than the 3"),
+        ({"anchor_share": 0.9, "n_uavs": 3}, "guides=3 is not allowed: from 0 to fewer than the 3"),
         ({"anchor_std": -1.0}, "std=-1.0 is not allowed: a standard deviation in m"),
         ({"nlos_time": 0.0}, "nlos_time=0.0 is not allowed: a time in s > 0"),
         ({"ins_bias": -1.0}, "bias=-1.0 is not allowed: a standard deviation in m/s"),
