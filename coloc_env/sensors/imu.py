@@ -96,8 +96,8 @@ class ImuOptions(Group):
 @dataclass(frozen=True)
 class SimulatedImuOptions(ImuOptions):
     """With ``imu_bias``, each UAV's sensors have constant biases of standard deviations
-    ``accel_bias`` and ``gyro_bias``; ``believed_imu_bias``: whether the team estimates them (none: if there are any).
-    ``imu=false`` leaves the IMU out, and a constant-velocity model."""
+    ``accel_bias`` and ``gyro_bias``; ``believed_imu_bias``: whether the team estimates biases
+    (none: if there are any). ``imu=false`` leaves the IMU out, and a constant-velocity model."""
 
     imu: bool = True
     imu_bias: bool = False
