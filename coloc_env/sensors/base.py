@@ -72,7 +72,10 @@ class Sensor(ABC):
     """
 
     informs: ClassVar[bool] = True
-    """Whether its leaves tell of where UAVs are (a frame that estimates are stated in does not)."""
+    """Whether it is a measurement (the frame that estimates are stated in is none)."""
+
+    between_uavs: ClassVar[bool] = False
+    """Whether it ties UAVs together (as a range between two does, a range to an anchor not)."""
 
     @property
     def delay(self) -> int:

@@ -64,6 +64,8 @@ class Ranging(Sensor):
     systematic errors of each pair (None: none).
     """
 
+    between_uavs = True
+
     noise: RangeNoise = field(default_factory=RangeNoise)
     tags: Tags = ()
     latency: int = 0

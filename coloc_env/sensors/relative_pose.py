@@ -28,6 +28,8 @@ class RelativePose(Sensor):
     and from all rotations. A pair whose link does not reach learns nothing.
     """
 
+    between_uavs = True
+
     matches: int = 1
     std: float = 0.05
     turn_std: float = math.radians(2.0)
@@ -89,6 +91,8 @@ class RecordedPoses(Sensor):
     What is recorded has its own noise. Wrong matches are drawn as ``sensor`` draws them, in place
     of what is recorded.
     """
+
+    between_uavs = True
 
     sensor: RelativePose
     pairs: tuple[tuple[int, int], ...]
