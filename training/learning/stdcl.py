@@ -54,7 +54,7 @@ VARIANTS = (
     "n_uavs=100:comm_radius=3500:nlos=0.3:motion=line",
     "n_uavs=150:comm_radius=2500",
     "n_uavs=150:comm_radius=2500:ins_bias=0:nlos=0.3:nlos_time=10",
-    "n_uavs=100:comm_radius=2200:anchors=0.25:motion=circle",
+    "n_uavs=100:comm_radius=2200:anchor_share=0.25:motion=circle",
     "n_uavs=150:comm_radius=1400",
     "n_uavs=120:comm_radius=1800:nlos=0.3",
 )
@@ -95,7 +95,7 @@ class StDclLoss(LossModule):
         train = tensordict["train"]
         variant = int(train["variant"][0, 0])
         loop, scene, scale = self.loops[variant], self.scenes[variant], self.scales[variant]
-        n, d, free = scene.arena.n_uavs, scene.arena.dim, slice(scene.guides, None)
+        n, d, free = scene.arena.n_uavs, scene.arena.dim, slice(scene.anchor_uavs, None)
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
         observed = tensordict["uav", "observation"]
         leaves = tuple(all_leaves(scene))
