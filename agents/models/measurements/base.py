@@ -5,9 +5,10 @@ UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from agents.models.process import Process
@@ -52,6 +53,7 @@ class Block:
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
     position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
     ``per_slot``) flattened, and ``mutual`` says that both UAVs hold the very same number.
+    ``distance`` (m) is that to the other UAV where it is what was measured.
     """
 
     residual: Float[Tensor, "B N m k"]
@@ -62,6 +64,7 @@ class Block:
     partner_variance: Float[Tensor, "B N m k"] | None = None
     per_slot: int = 1
     mutual: bool = False
+    distance: Float[Tensor, "B N m 1"] | None = None
 
     @property
     def total_variance(self) -> Float[Tensor, "B N m k"]:
@@ -69,6 +72,24 @@ class Block:
         if self.partner_variance is None:
             return self.variance
         return self.variance + self.partner_variance
+
+    def of(self, slot: Int64[Tensor, "N"], slots: int) -> "Block":
+        """Only the measurements that involve the UAV in the slot (of ``slots``) given for each."""
+        every = torch.arange(slots, device=slot.device).repeat_interleave(self.per_slot)
+        every = every.repeat(self.mask.shape[-1] // len(every))
+        return replace(self, mask=self.mask & (every == slot.unsqueeze(-1)))
+
+    def bent(self, apart: Float[Tensor, "B N d d"]) -> "Block":
+        """With what linearizing distances neglects as noise: their variance grows by
+        ((tr M − uᵀ M u) / 2 d)², M being the covariance of the two UAVs' relative position, d their
+        distance and u its direction."""
+        if self.distance is None:
+            return self
+        assert self.partner is not None
+        u, m = self.partner, apart[:, :, None, None]  # [B, N, m, 1, d] and [B, N, 1, 1, d, d]
+        along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
+        lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+        return replace(self, variance=self.variance + (lateral / (2 * self.distance)) ** 2)
 
 
 class Measurement(ABC):

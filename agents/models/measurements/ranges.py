@@ -157,4 +157,5 @@ class UavRanges(_Ranges):
             partner_variance=added.flatten(-2).unsqueeze(-1),
             per_slot=t,
             mutual=True,
+            distance=(ranges.flatten(-2).unsqueeze(-1) - block.residual).clamp_min(1e-3),
         )
