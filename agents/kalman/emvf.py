@@ -15,7 +15,7 @@ from torch import Tensor
 from agents.kalman.dead_reckoning import DeadReckoning
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import Block, make_measurements, nobody
+from agents.models.measurements import AnchorRanges, Block, make_measurements, nobody
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
@@ -220,11 +220,13 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         linear in (p, ‖p‖²). The arena's centre without anchors."""
         d, arena = self.process.dim, self.believed.arena
         centre = leaves["prior"].new_tensor(arena.centre).double()
-        if self.believed.sensor(AnchorRanging) is None:
+        sensor = self.believed.sensor(AnchorRanging)
+        if sensor is None:
             return centre.expand(*leaves["prior"].shape[:2], d)
         anchors = leaves["anchor_map"].double().unflatten(-1, (-1, d)) - centre
-        ranges = leaves["anchor_ranges"].double().unflatten(-1, (-1, anchors.shape[-2]))
-        there = leaves["anchor_range_mask"].double().unflatten(-1, ranges.shape[-2:])
+        z, mask = AnchorRanges(sensor).read(leaves)
+        ranges = z.double().unflatten(-1, (-1, anchors.shape[-2]))
+        there = mask.double().unflatten(-1, ranges.shape[-2:])
         ones = torch.ones_like(anchors[..., :1])
         design = torch.cat((-2 * anchors, ones), -1).unsqueeze(-3)
         design = (design * there.unsqueeze(-1)).flatten(2, 4)

@@ -44,7 +44,7 @@ def evidence(
     else:
         ranges, anchors = model.ends(observation, alone)
         distance = (state[..., None, : process.dim] - anchors).norm(dim=-1)
-        mask = observation["anchor_range_mask"] > 0
+        mask = model.read(observation)[1]
         residual = (ranges - distance) * mask
         squared = residual.square() / model.variance
     return Evidence(squared.sum(-1).float(), residual.abs().float(), mask.sum(-1).float())

@@ -15,6 +15,9 @@ from agents.models.process import Process
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
+_FARTHEST = 1e4  # m: of distances that a sensor can measure
+_LEAST_STD = 1e-3  # m, rad
+
 
 @dataclass(frozen=True)
 class Neighbours:
@@ -36,11 +39,13 @@ def heard(believed: Believed, observation: Observation) -> Neighbours:
     """Neighbours as their messages tell: past estimates, moved on at their velocity."""
     d = believed.arena.dim
     content = observation["messages"].double().unflatten(-1, (believed.slots, 3 * d))
+    known = (observation["message_mask"] > 0) & content.isfinite().all(-1)
+    content = content.masked_fill(~known.unsqueeze(-1), 0.0)
     age = believed.arena.dt * (1 + believed.message_delay)
     return Neighbours(
         position=content[..., :d] + age * content[..., d : 2 * d],
         variance=(2 * content[..., 2 * d :]).exp(),
-        known=observation["message_mask"] > 0,
+        known=known,
     )
 
 
@@ -90,6 +95,23 @@ class Block:
         along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
         lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
         return replace(self, variance=self.variance + (lateral / (2 * self.distance)) ** 2)
+
+
+def usable(
+    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
+) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
+    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
+    ``ranges``, the first is no distance that a sensor can give. Every measurement model reads its
+    leaves through this."""
+    mask = mask & z.isfinite().all(-1)
+    if ranges:
+        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
+    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
+
+
+def noise_std(std: float) -> float:
+    """The noise (m, rad) that a filter may assume: a sensor without any would leave no weights."""
+    return max(std, _LEAST_STD)
 
 
 class Measurement(ABC):
