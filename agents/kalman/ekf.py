@@ -19,6 +19,7 @@ from agents.models.measurements import Block, Neighbours, heard, make_measuremen
 from agents.models.update import information, iterated_update, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
+from coloc_env.options import PositiveCount, Share
 from coloc_env.scenario import Believed
 
 # Weights tried by covariance intersection.
@@ -43,14 +44,12 @@ class CooperativeEkf(GaussianFilter):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: float = 0.999,
+        gate: Share = 0.999,
         fusion: Literal["naive", "ci"] = "naive",
-        iterations: int = 2,
+        iterations: PositiveCount = 2,
         cooperate: bool = True,
     ) -> None:
         super().__init__(believed)
-        if iterations < 1:
-            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.iterations, self.fusion = iterations, fusion
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)

@@ -20,6 +20,7 @@ from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import Prediction, RobustScreen, Trust
 from coloc_env.observation import Observation
+from coloc_env.options import PositiveCount, Share
 from coloc_env.scenario import Believed
 
 
@@ -37,8 +38,8 @@ class JointEkf(Localizer[GaussianBelief]):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: float = 0.999,
-        iterations: int = 2,
+        gate: Share = 0.999,
+        iterations: PositiveCount = 2,
         cooperate: bool = True,
     ) -> None:
         super().__init__(believed)
@@ -47,8 +48,6 @@ class JointEkf(Localizer[GaussianBelief]):
                 f"ekf_joint: a team of {believed.arena.n_uavs} with {believed.slots} neighbour "
                 "slots is too large for it; raise max_neighbours to the team's size"
             )
-        if iterations < 1:
-            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.process, self.iterations = make_process(believed), iterations
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen = RobustScreen(self.process, self.models, robust, gate)

@@ -5,7 +5,7 @@ happened before the window is forgotten, and so is any failure.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -20,6 +20,7 @@ from agents.models.process import Process
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
+from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Layout
@@ -63,15 +64,11 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self,
         believed: Believed,
         *,
-        memory: int = 3,
-        iterations: int = 4,
+        memory: Annotated[int, Quantity("steps", 2, 1000)] = 3,
+        iterations: PositiveCount = 4,
         robust: Literal["none", "huber"] = "none",
     ) -> None:
         super().__init__(believed)
-        if memory < 2 or iterations < 1:
-            raise ValueError(
-                f"memory={memory}, iterations={iterations} is not allowed: at least 2 steps and 1"
-            )
         self.size, self.iterations, self.robust = memory, iterations, robust == "huber"
         self.reckoning = DeadReckoning(believed)
         self.process: Process = self.reckoning.process

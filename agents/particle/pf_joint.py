@@ -1,6 +1,8 @@
 """One bootstrap particle filter over a whole team's relative poses (Gordon, Salmond & Smith 1993):
 what the collaborative Stein particle filter is measured against."""
 
+from typing import Annotated
+
 import torch
 from jaxtyping import Float, Float64, Int64
 from tensordict import TensorClass
@@ -16,6 +18,7 @@ from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
+from coloc_env.options import Count, Quantity, Share
 from coloc_env.scenario import Believed
 
 _ROUGH = 0.2  # of the annealed scale: what resampled particles are moved by
@@ -48,16 +51,14 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         self,
         believed: Believed,
         *,
-        particles: int = 150,
-        anneal: float = 0.0,
-        outliers: float = 0.2,
-        seed: int = 0,
+        particles: Annotated[int, Quantity("", 2, 100_000)] = 150,
+        anneal: Share = 0.0,
+        outliers: Share = 0.2,
+        seed: Count = 0,
     ) -> None:
-        if not 0 <= anneal < 1:
+        if anneal == 1:
             raise ValueError(f"anneal={anneal} is not allowed: a factor in [0, 1)")
         super().__init__(believed, outliers, anneal or 1.0)
-        if particles < 2:
-            raise ValueError(f"particles={particles} is not allowed: at least 2")
         self.particles, self.annealing, self.seed = particles, anneal > 0, seed
 
     def reset(self, observation: Observation) -> TeamCloud:
