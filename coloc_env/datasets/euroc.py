@@ -1,4 +1,4 @@
-"""EuRoC MAV: IMU and full-state truth; sequences of one room, flown "together" as a team."""
+"""EuRoC MAV: IMU and full-state truth; sequences of one room "together", as a team."""
 
 import os
 from collections.abc import Iterable
@@ -39,7 +39,7 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     A folder holds ``imu0.csv`` and ``groundtruth.csv``, or is laid out as ETH publishes it
     (``mav0/imu0/data.csv``, ``mav0/state_groundtruth_estimate0/data.csv``). Time zero of each
     sequence is its own first truth; IMU samples before it have negative times. The body frame is
-    the IMU's with the axes named anew (z, -y, x become forward, left, up), for IMU, attitude and
+    the IMU's with the axes renamed (z, -y, x become forward, left, up), for IMU, attitude and
     biases alike; "forward" points 22 degrees below the horizon in level flight, as the camera
     does. The truth (200 Hz, but 20 Hz in OpenVINS's V1_01_easy) is itself a batch estimate that
     used the IMU. Stream: imu.
@@ -57,7 +57,7 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     names = tuple(path.name for path in paths)
     if len(set(map(room, names))) != 1 or len(set(names)) != len(names):
         given = ", ".join(names) or "none"
-        raise DataError(f"a EuRoC team is made of different sequences of one room, not {given}")
+        raise DataError(f"a EuRoC team consists of different sequences of one room, not {given}")
     tracks, tables = zip(*map(_sequence, paths), strict=True)
     return Recording(
         name="euroc/" + "+".join(names),
@@ -78,7 +78,7 @@ def robots_in(folder: Path) -> tuple[str, ...]:
 
 
 def room(sequence: str) -> str:
-    """The room a sequence was flown in: the part of its name before the first ``_``."""
+    """The room a sequence was recorded in: the part of its name before the first ``_``."""
     return sequence.split("_")[0]
 
 

@@ -36,7 +36,7 @@ _CACHE_VERSION = 1
 
 
 class DataError(ValueError):
-    """Recorded data that are missing or not what they should be; one line that says where."""
+    """Recorded data that are missing or not what they should be; one line that names where."""
 
 
 def data_root(data: str | os.PathLike[str] | None = None) -> Path:

@@ -127,10 +127,10 @@ def test_who_hears_nobody_dead_reckons_and_says_how_unsure_it_is(agent: str) -> 
     seeds = torch.tensor([0])
     alone = flown(agent, seeds, comm_radius=1.0)
     reckoned = flown("dead_reckoning", seeds, comm_radius=1.0)
-    guides = 10
+    anchors = 10
     for x, y in zip(alone[::2], reckoned[::2], strict=True):
-        assert torch.allclose(x[:, guides:], y[:, guides:], atol=1e-3)
-    first, last = alone[1][:, guides:], alone[-1][:, guides:]
+        assert torch.allclose(x[:, anchors:], y[:, anchors:], atol=1e-3)
+    first, last = alone[1][:, anchors:], alone[-1][:, anchors:]
     assert (last.diagonal(dim1=-2, dim2=-1) > first.diagonal(dim1=-2, dim2=-1)).all()
 
 

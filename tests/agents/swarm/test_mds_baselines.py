@@ -384,9 +384,9 @@ def flown(agent: str, steps: int = 6, **overrides: Any) -> tuple[Tensor, Tensor,
 def test_they_localize(agent: str) -> None:
     error, _, _ = flown(agent, 15, nlos=0.0)
     reckoned, _, _ = flown("dead_reckoning", 15, nlos=0.0)
-    guides = 9
-    assert error[5:, :, guides:].square().mean().sqrt() < 12.0
-    assert reckoned[5:, :, guides:].square().mean().sqrt() > 60.0
+    anchors = 9
+    assert error[5:, :, anchors:].square().mean().sqrt() < 12.0
+    assert reckoned[5:, :, anchors:].square().mean().sqrt() > 60.0
 
 
 @pytest.mark.parametrize("agent", [*METHODS, "fcmds:start=paths", "dwmds:prior_weight=0"])
@@ -413,9 +413,9 @@ def test_no_network_is_too_broken(agent: str, overrides: dict[str, Any]) -> None
 def test_who_hears_nobody_dead_reckons_and_says_how_unsure_it_is(agent: str) -> None:
     _, alone, covariance = flown(agent, comm_radius=1.0)
     _, reckoned, expected = flown("dead_reckoning", comm_radius=1.0)
-    guides = 9
-    assert torch.allclose(alone[..., guides:, :], reckoned[..., guides:, :], atol=1e-3)
-    assert torch.allclose(covariance[:, :, guides:], expected[:, :, guides:], rtol=1e-4)
+    anchors = 9
+    assert torch.allclose(alone[..., anchors:, :], reckoned[..., anchors:, :], atol=1e-3)
+    assert torch.allclose(covariance[:, :, anchors:], expected[:, :, anchors:], rtol=1e-4)
 
 
 @pytest.mark.parametrize("agent", METHODS)

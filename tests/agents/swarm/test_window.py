@@ -20,7 +20,7 @@ from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
 SMALL: dict[str, Any] = {"n_uavs": 14, "anchor_share": 0.3, "ins_bias": 0.0, "horizon": 20}
-GUIDES, STD, INS, PRIOR, FIX = 4, 10.0, 0.5, 50.0, 0.1  # UAVs; the rest in m and m/s
+ANCHORS, STD, INS, PRIOR, FIX = 4, 10.0, 0.5, 50.0, 0.1  # UAVs; the rest in m and m/s
 PLAIN = "dwmds_st:confidence=none"
 
 
@@ -76,7 +76,7 @@ def test_the_pull_is_the_stress_gradient() -> None:
 def test_guttman_steps_never_raise_the_stress(relaxed: float) -> None:
     place, past = remembered()
     fixed = torch.zeros(place.shape[:2], dtype=torch.bool)
-    fixed[:, :GUIDES] = True
+    fixed[:, :ANCHORS] = True
     distance, weight = past.distance[:, :, 0] + 3.0, past.weight[:, :, 0]
     everybody = torch.arange(place.shape[1])
     total = weight + past.weight.sum(2)
