@@ -72,12 +72,19 @@ def staged_file(out: Path) -> Iterator[Path]:
 
 def recover(out: Path) -> None:
     """Complete a replacement in the folder ``out`` that was cut short by the end of its process."""
+    out = _resolved(out)
     journal = _journal(out)
     if journal.exists():
         with locked(out):
             if journal.exists():  # not another process's, which has completed it meanwhile
                 _move_in(out, journal)
                 _forget(out, journal)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what processes that were killed left in a folder that is ours alone."""
+    for leftover in list(folder.rglob(".*.partial-*")):
+        _remove(leftover)
 
 
 @contextmanager

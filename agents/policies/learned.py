@@ -9,7 +9,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.policies.actor import Actor
-from agents.weights import card_of, drawn_from, load
+from agents.weights import drawn_from, learned
 from agents.wrappers.correction import Correction
 from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
@@ -67,16 +67,7 @@ class PolicyAgent(Localizer[PolicyBelief]):
             with drawn_from(0):
                 self.actor = actor_for(self.mode)
         else:
-            card = card_of(weights)
-            if card["kind"] != Actor.kind:
-                raise ValueError(
-                    f"{weights} holds weights of kind {card['kind']!r}: a policy's are needed"
-                )
-            try:
-                with drawn_from(0):
-                    self.actor = Actor(**card["architecture"])
-            except (AttributeError, KeyError, TypeError) as error:
-                raise ValueError(f"{weights}: its card describes no policy: {error}") from None
+            self.actor = learned(Actor, weights)
             self.mode = mode_of(believed, self.actor.architecture["mode"])
             known, given = self.actor.architecture["inputs"], inputs_of(self.mode)
             if known != given:
@@ -84,7 +75,6 @@ class PolicyAgent(Localizer[PolicyBelief]):
                     f"{weights} was trained on the leaves {_words(known)}: this scenario has "
                     f"{_words(given)}"
                 )
-            load(weights, self.actor)
         self.actor.requires_grad_(False)
 
     @classmethod

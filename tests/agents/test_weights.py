@@ -9,8 +9,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from agents.particle.corrector import WeightCorrector
-from agents.weights import Learned, load, shipped
-from training.learning.checkpoints import write
+from agents.weights import Learned, learned, load, shipped, write
 
 
 class Other(Learned):
@@ -63,7 +62,7 @@ def test_weights_come_back(corrector: WeightCorrector, file: Path, ending: str) 
     weight = other.hidden.weight
     card = load(file.parent / ending, other)
     assert card["command"] == "none"
-    assert other.hidden.weight is weight, "in place: a filter that flies with it sees the change"
+    assert other.hidden.weight is weight, "in place: a filter that uses it sees the change"
     for name, value in corrector.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
 

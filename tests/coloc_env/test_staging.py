@@ -291,8 +291,9 @@ def test_what_is_written_is_on_the_disk_before_it_has_its_name(
 
 
 def test_a_full_disk_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=r"No space left on device: .*a\.json"), staged_file(
-        tmp_path / "a.json"
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*a\.json"),
+        staged_file(tmp_path / "a.json"),
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert everything(tmp_path) == {}

@@ -15,7 +15,7 @@ import torch
 
 from training.learning import pfnn
 from training.learning import run as runs
-from training.learning import state as savepoints
+from training.learning import state as states
 
 SMALL = {"scenario": "indoor-v0:n_uavs=2:horizon=10", "worlds": 1, "epochs": 4, "score_runs": 0}
 
@@ -73,16 +73,16 @@ def test_interrupted_in_saving(
     """A process that dies half-way through writing cleans nothing up."""
     saved = 0
 
-    def dies(tensors: object, file: Path, header: object) -> None:
+    def dies(file: Path, state: Any) -> None:
         nonlocal saved
         saved += 1
         if saved == 3:
             (file.parent / ".state.partial-1.safetensors").write_bytes(b"half")
             raise SystemExit
-        keep(tensors, file, header)
+        keep(file, state)
 
-    keep = savepoints.save_file
-    monkeypatch.setattr(savepoints, "save_file", dies)
+    keep = states.save
+    monkeypatch.setattr(states, "save", dies)
     with pytest.raises(SystemExit):
         runs.start("pfnn", {"mode": mode} | SMALL, tmp_path / "run", quiet)
     monkeypatch.undo()
@@ -115,12 +115,12 @@ def test_killed(mode: str, unbroken: dict[str, bytes], tmp_path: Path) -> None:
     )
     state, deadline = out / "state.safetensors", time.monotonic() + 300
     while process.poll() is None and time.monotonic() < deadline:
-        if state.exists() and savepoints.load(state)["collector"]["epoch"] >= 1:
+        if state.exists() and states.load(state)["trainer"]["collector"]["epoch"] >= 1:
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
-    _, told = process.communicate()
-    assert process.returncode == -signal.SIGKILL, told.decode()
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors.decode()
     assert not (out / "pfnn.safetensors").exists()
     runs.resume(out, quiet)
     assert outcome(out) == unbroken
@@ -177,11 +177,11 @@ def test_damaged_save_point(tmp_path: Path) -> None:
         "optimizer": {"state": {0: {"step": torch.tensor(1.0)}}, "groups": [{"lr": 0.1}, None]},
     }
     file = tmp_path / "state.safetensors"
-    savepoints.save(file, state)
-    again = savepoints.load(file)
+    states.save(file, state)
+    again = states.load(file)
     assert torch.equal(again["weights"]["a"], state["weights"]["a"])
     assert again["optimizer"]["state"][0]["step"] == 1
     assert again["optimizer"]["groups"] == [{"lr": 0.1}, None]
     file.write_bytes(file.read_bytes()[:-3])
     with pytest.raises(ValueError, match="damaged"):
-        savepoints.load(file)
+        states.load(file)
