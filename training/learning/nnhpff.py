@@ -170,7 +170,7 @@ def nnhpff(
 
 
 def _figures(loss: DetectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
-    """Cross-entropy, a constant forecast's, the share that failed, and the share classified right."""
+    """Cross-entropy, a constant forecast's, the share that failed, and the accuracy."""
     failed: Bool[Tensor, "P"] = rows["failed"]
     share = failed.double().mean()
     logits: Float32[Tensor, "P 2"] = loss.detector(rows["features"])

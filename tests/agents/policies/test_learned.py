@@ -153,7 +153,7 @@ def refused(file: Path | str, words: str, scenario: Scenario | None = None) -> N
 
 
 def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
-    refused("pfnn", "pfnn holds weights of kind 'pfnn': 'policy' is needed")
+    refused("pfnn", "pfnn.safetensors holds weights of kind 'pfnn': 'policy' is needed")
     root = Path(__file__).parents[3] / "checkpoints"
     for end in ("safetensors", "json"):
         shutil.copy(root / f"pfnn.{end}", tmp_path / f"mine.{end}")

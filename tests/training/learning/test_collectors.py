@@ -10,8 +10,7 @@ from agents import make
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
-from training.learning.collectors import episode_collector
-from training.learning.collectors import Concatenated, RoundRobin
+from training.learning.collectors import Concatenated, RoundRobin, episode_collector
 
 
 class Finite:
