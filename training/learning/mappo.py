@@ -31,7 +31,7 @@ from coloc_env.options import Factor, PositiveCount, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import (
     Concatenated,
     EpochCollector,
@@ -252,7 +252,7 @@ def score(
         key = ":".join(f"{k}={v}" for k, v in scenario.overrides.items())
         found[key] = {}
         for agent, one in compared.items():
-            recorded = play(one, scenario, torch.arange(runs), lambda steps: None)
-            found[key][agent] = metrics.rmse(recorded.error.numpy(), recorded.scored.numpy())
+            result = record(one, scenario, torch.arange(runs))
+            found[key][agent] = metrics.rmse(result.error, result.worlds.scored)
         progress("scoring", len(found), len(scenarios))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found}

@@ -23,7 +23,7 @@ from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from coloc_env.sensors import AnchorRanging
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import (
     Concatenated,
     EpochCollector,
@@ -198,10 +198,10 @@ def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -
             one: Any = make(name, scenario, **options)
             if name == "nnhpff":
                 one.learn(detector)
-            recorded = play(one, scenario, torch.arange(runs), lambda steps: None)
-            each[f"{name}_mean"] = float(recorded.error.mean())
-            if "resets_per_run" in recorded.series:
-                each[f"{name}_resets"] = float(recorded.series["resets_per_run"].sum(1).mean())
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_mean"] = float(result.error.mean())
+            if "resets_per_run" in result.series:
+                each[f"{name}_resets"] = float(result.series["resets_per_run"].sum(1).mean())
         found[f"case {case}"] = each
         progress("scoring", case, 3)
     return {"runs": runs, "seeds": [0, runs - 1], **found}

@@ -24,7 +24,7 @@ from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import (
     Batches,
     EpochCollector,
@@ -214,7 +214,7 @@ def score(localizer: Any, scenario: Scenario, runs: int, progress: Progress) -> 
     """RMSE (m) of ``apf`` and of the trained filter in the worlds of seeds 0 … runs − 1."""
     if runs == 0:
         return {}
-    plain, recorded = make("apf", scenario, seed=localizer.seed), {}
+    plain, records = make("apf", scenario, seed=localizer.seed), {}
     for name, one in (("apf", plain), ("pfnn", localizer)):
         done = 0
 
@@ -223,10 +223,10 @@ def score(localizer: Any, scenario: Scenario, runs: int, progress: Progress) -> 
             done += steps
             progress(f"scoring {name}", done, runs * scenario.horizon)
 
-        recorded[name] = play(one, scenario, torch.arange(runs), tick)
+        records[name] = record(one, scenario, torch.arange(runs), tick)
     per_run = {
-        name: metrics.rmse_per_run(one.error.numpy(), one.scored.numpy())
-        for name, one in recorded.items()
+        name: metrics.rmse_per_run(result.error, result.worlds.scored)
+        for name, result in records.items()
     }
     difference = metrics.paired_difference(per_run["pfnn"], per_run["apf"])
     return {

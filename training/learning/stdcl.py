@@ -23,7 +23,7 @@ from coloc_env.options import Factor, Quantity, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.augmentation import SwarmAugmentation
 from training.learning.collectors import (
     EpochCollector,
@@ -224,10 +224,8 @@ def stdcl(
 
 def _scale(base: str, scenario: Scenario) -> float:
     """RMSE (m) of the optimizer alone, after it has settled."""
-    recorded = play(
-        make(base, scenario), scenario, _SCALE_SEED + torch.arange(4), lambda steps: None
-    )
-    return metrics.rmse(recorded.error[:, 5:].numpy(), recorded.scored[:, 5:].numpy())
+    result = record(make(base, scenario), scenario, _SCALE_SEED + torch.arange(4))
+    return metrics.rmse(result.error[:, 5:], result.worlds.scored[:, 5:])
 
 
 def score(
@@ -242,8 +240,8 @@ def score(
         loop.learn(network)
         each = {}
         for name, one in (("trained", loop), ("optimizer", make(base, scenario))):
-            recorded = play(one, scenario, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(recorded.error.numpy(), recorded.scored.numpy())
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
         progress("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found

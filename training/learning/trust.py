@@ -22,7 +22,7 @@ from coloc_env.options import Factor
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import (
     EpochCollector,
     Epochs,
@@ -137,7 +137,7 @@ def trust(
     seed: Seed = 0,
     score_runs: ScoreRuns = 10,
 ) -> Training:
-    """The trust networks of ``ekf_trust`` and ``pfnn_trust``, through a differentiable EKF.
+    """The trust networks of ``ekf_trust`` and ``pf_trust``, through a differentiable EKF.
 
     In each of ``epochs`` epochs ``worlds`` new worlds of every variant of ``scenario`` (clean,
     NLOS, false matches, few landmarks, uniform prior, combinations) are run by ``ekf_trust``
@@ -192,8 +192,8 @@ def score(network: TrustNetwork, base: str, runs: int, progress: Progress) -> Ma
             ("ekf_trust", learned),
             ("ekf_huber", make("ekf:robust=huber", scenario)),
         ):
-            recorded = play(one, scenario, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(recorded.error.numpy(), recorded.scored.numpy())
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
         progress("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "steps": 300, "rmse": found}
