@@ -7,7 +7,7 @@ they were trained. Nothing is ever executed by loading: safetensors holds number
 import hashlib
 import json
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -75,10 +75,14 @@ def learned(kind: type[_L], weights: str | Path, seed: int = 0, **architecture: 
     file, card, tensors = _read(weights, kind)
     own = card.get("architecture", {})
     _check_architecture(f"{file}: its card", kind, own)
+    unlike = f"{file}: its card has an architecture that no {kind.kind} has"
     try:
         module = untrained(kind, seed, **{**architecture, **own})
     except (ArithmeticError, LookupError, AttributeError, TypeError, ValueError, RuntimeError):
-        raise ValueError(f"{file}: its card has an architecture that no {kind.kind} has") from None
+        raise ValueError(unlike) from None
+    missing = sorted(module.architecture.keys() - own.keys())
+    if missing:
+        raise ValueError(f"{unlike}: {', '.join(missing)} missing")
     _fill(module, file, card, tensors)
     return module
 
@@ -209,12 +213,12 @@ def _fill(
     names, shapes and types that it needs, and are finite."""
     if card["features"] != list(module.features):
         raise ValueError(
-            f"{file} was trained on the features {', '.join(card['features'])}: "
-            f"{', '.join(module.features)} are needed"
+            f"{file} was trained on the features {_list(card['features'])}: "
+            f"{_list(module.features)} are needed"
         )
     needed = module.state_dict()
     if found.keys() != needed.keys():
-        raise ValueError(f"{file} holds {', '.join(sorted(found))}: {', '.join(needed)} are needed")
+        raise ValueError(f"{file} holds {_list(sorted(found))}: {_list(needed)} are needed")
     for key, value in needed.items():
         got = found[key]
         if got.shape != value.shape or got.dtype != value.dtype:
@@ -222,6 +226,11 @@ def _fill(
         if not bool(torch.isfinite(got).all()):
             raise ValueError(f"{file}: {key} holds NaN or infinity")
     module.load_state_dict(dict(found))
+
+
+def _list(names: Iterable[str]) -> str:
+    """Names in one line."""
+    return ", ".join(" ".join(name.split()) for name in names)
 
 
 def _describe(value: Tensor) -> str:

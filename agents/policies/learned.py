@@ -23,11 +23,11 @@ def mode_of(believed: Believed, settings: dict[str, Any]) -> ActionMode:
     kinds: dict[Any, Any] = {kind.name: kind for kind in (Correction, Displacement)}
     options = dict(settings)
     kind = options.pop("name", None)
-    if kind not in kinds:
+    if not isinstance(kind, str | None) or kind not in kinds:
         raise ValueError(f"action mode {kind!r} is not one that policies have: {', '.join(kinds)}")
     try:
         mode: ActionMode = kinds[kind](believed, **options)
-    except TypeError as error:
+    except (AttributeError, TypeError) as error:
         raise ValueError(f"action mode {kind!r}: {error}") from None
     return mode
 
@@ -69,6 +69,10 @@ class PolicyAgent(Localizer[PolicyBelief]):
         else:
             self.actor = learned(Actor, weights)
             self.mode = mode_of(believed, self.actor.architecture["mode"])
+            if self.mode.settings != self.actor.architecture["mode"]:
+                raise ValueError(
+                    f"{weights}: its card's mode is incomplete: {self.mode.settings} is needed"
+                )
             known, given = self.actor.architecture["inputs"], inputs_of(self.mode)
             if known != given:
                 raise ValueError(

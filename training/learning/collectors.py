@@ -17,8 +17,8 @@ from coloc_env.scenario import Scenario
 
 Seed = Annotated[int, Quantity("", 0, 10**9)]
 Worlds = Annotated[int, Quantity("", 1, 1 << 16)]  # of an epoch, in parallel
-Epochs = Annotated[int, Quantity("", 1, 10**6)]
-Steps = Annotated[int, Quantity("", 1, 10**6)]
+Epochs = Annotated[int, Quantity("", 1, 10**5)]
+Steps = Annotated[int, Quantity("", 1, 10**5)]
 ScoreRuns = Annotated[int, Quantity("", 0, 10**5)]
 Width = Annotated[int, Quantity("", 1, 1 << 12)]  # of a layer
 
