@@ -6,6 +6,7 @@ they were trained. Nothing is ever executed by loading: safetensors holds number
 
 import hashlib
 import json
+import math
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -35,7 +36,7 @@ _OPTIONAL = {
     "epochs": PositiveCount,
     "frames": PositiveCount,
     "versions": dict[str, str],
-    "metrics": dict[str, float],
+    "metrics": dict[str, float | None],
     "scores": dict,
 }
 _LARGEST = 10_000  # whole number in an architecture: beyond, it would fill the memory
@@ -106,7 +107,8 @@ def card_of(source: str | Path) -> dict[str, Any]:
 def write(weights: Path, module: Learned, trained: Mapping[str, Any]) -> None:
     """Write ``weights`` (NAME.safetensors) and its card NAME.json.
 
-    ``trained``: what the card says of how the weights came to be. Both files are complete before
+    ``trained``: what the card says of how the weights came to be; a number that is NaN or infinite
+    becomes null. Both files are complete before
     either gets its name; should only one get it, the hashes differ and loading says so.
     """
     data = serialized({name: value.contiguous() for name, value in module.state_dict().items()})
@@ -117,7 +119,7 @@ def write(weights: Path, module: Learned, trained: Mapping[str, Any]) -> None:
         "sha256": hashlib.sha256(data).hexdigest(),
         **trained,
     }
-    text = json.dumps(card, indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(_finite(card), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with staged_file(weights.with_suffix(".json")) as second, staged_file(weights) as first:
         first.write_bytes(data)
         second.write_text(text, encoding="utf-8")
@@ -226,6 +228,15 @@ def _fill(
         if not bool(torch.isfinite(got).all()):
             raise ValueError(f"{file}: {key} holds NaN or infinity")
     module.load_state_dict(dict(found))
+
+
+def _finite(value: Any) -> Any:
+    """What JSON can hold of a value."""
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _list(names: Iterable[str]) -> str:

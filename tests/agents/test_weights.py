@@ -73,6 +73,13 @@ def test_weights_come_back(corrector: WeightCorrector, file: Path, ending: str) 
         assert torch.equal(value, other.state_dict()[name])
 
 
+def test_figures_that_do_not_apply_are_null(corrector: WeightCorrector, file: Path) -> None:
+    write(file, corrector, {"metrics": {"a": float("nan"), "b": 1.5}, "scores": {"c": [1e999]}})
+    card = load(file, corrector)
+    assert card["metrics"] == {"a": None, "b": 1.5}
+    assert card["scores"] == {"c": [None]}
+
+
 def test_every_shipped_checkpoint_says_how_it_was_trained() -> None:
     for name in shipped():
         folder = Path(__file__).parents[2] / "checkpoints"

@@ -271,11 +271,12 @@ def test_nothing_collected_is_an_error(tmp_path: Path, monkeypatch: pytest.Monke
     assert not (tmp_path / "run/pfnn.safetensors").exists()
 
 
-def test_weights_that_are_nan_are_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="NaN or infinite after training"):
-        runs.start(
-            "pfnn", {**SMALL, "mode": "online", "learning_rate": 1e12}, tmp_path / "r", quiet
-        )
+def test_weights_that_are_nan_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = pfnn.CorrectorLoss.error
+    monkeypatch.setattr(pfnn.CorrectorLoss, "error", lambda *given: error(*given) * torch.nan)
+    with pytest.raises(ValueError, match=r"hidden.weight is NaN or infinite after training"):
+        runs.start("pfnn", SMALL, tmp_path / "run", quiet)
+    assert not (tmp_path / "run/pfnn.safetensors").exists()
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(
