@@ -33,7 +33,6 @@ from training.learning.collectors import (
     Seed,
     Worlds,
     episode_collector,
-    require_batches,
     world_seed,
 )
 from training.learning.replay_buffer import replay_buffer_trainer
@@ -145,7 +144,10 @@ def pfnn(
     and ``pfnn`` are compared in ``score_runs`` held-out worlds of it.
     """
     parsed = parse_scenario(scenario)
-    require_batches("pfnn", [parsed], EVERY)
+    if parsed.horizon < EVERY:
+        raise ValueError(
+            f"pfnn: a horizon of {parsed.horizon} steps is too short: {EVERY} at least"
+        )
     localizer: Any = make("pfnn", parsed, weights="none", seed=seed)
     loss = CorrectorLoss(localizer.corrector)
     steps = EVERY if mode == "online" else parsed.horizon // EVERY * EVERY

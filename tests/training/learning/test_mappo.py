@@ -19,6 +19,7 @@ from agents import make
 from agents.policies.actor import Actor
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
+from training.evaluation.record import record
 from training.learning import mappo
 from training.learning import run as runs
 from training.learning.collectors import world_seed
@@ -184,8 +185,8 @@ def test_card_and_scores(tmp_path: Path) -> None:
     assert set(found) == {"mappo", "ekf", "ekf:robust=huber"}
     for agent in found:
         one = make(f"mappo:weights={weights}" if agent == "mappo" else agent, scenario)
-        recorded = play(one, scenario, torch.arange(2), lambda steps: None)
-        expected = float(recorded.error.square().mean().sqrt())
+        recorded = record(one, scenario, torch.arange(2))
+        expected = float(np.sqrt(np.square(recorded.error).mean()))
         assert found[agent] == pytest.approx(expected, rel=1e-4)
 
 
@@ -418,15 +419,15 @@ def test_only_mappos_critic_sees_the_team() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "worlds=0 is not allowed: 1 to"),
-        ({"minibatches": 0}, "minibatches=0 is not allowed: 1 to"),
-        ({"hidden": 0}, "hidden=0 is not allowed: 1 to"),
-        ({"seed": -1}, "seed=-1 is not allowed: 0 to"),
-        ({"learning_rate": 0.0}, "learning_rate=0.0 is not allowed: more than 0"),
-        ({"clip": -0.2}, "clip=-0.2 is not allowed: more than 0"),
-        ({"gamma": 1.5}, "gamma=1.5 is not allowed: a number in [0, 1]"),
-        ({"entropy": -1.0}, "entropy=-1.0 is not allowed: a number in [0, 1]"),
-        ({"steps": 11}, "no horizon shorter than steps=11"),
+        ({"worlds": 0}, "worlds=0 is not allowed: a whole number"),
+        ({"minibatches": 0}, "minibatches=0 is not allowed: a whole number"),
+        ({"hidden": 0}, "hidden=0 is not allowed: a whole number"),
+        ({"seed": -1}, "seed=-1 is not allowed: a whole number"),
+        ({"learning_rate": 0.0}, "learning_rate=0.0 is not allowed: a number > 0"),
+        ({"clip": -0.2}, "clip=-0.2 is not allowed: a number > 0"),
+        ({"gamma": 1.5}, "gamma=1.5 is not allowed: a number from 0 to 1"),
+        ({"entropy": -1.0}, "entropy=-1.0 is not allowed: a number from 0 to 1"),
+        ({"steps": 11}, "steps=11 is not allowed: at most 10"),
         ({"worlds": 5, "variants": "nlos=0.1/nlos=0.2"}, "worlds=5 must be a multiple of the 2 va"),
         ({"variants": "nlos=0.1/nloss=0.2"}, "unknown option 'nloss' (did you mean 'nlos'?)"),
         (
@@ -437,7 +438,7 @@ def test_only_mappos_critic_sees_the_team() -> None:
         ({"variants": "horizon=10/horizon=30"}, "must have one horizon, one number of UAVs, and"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
         ({"base": "mappo:weights=none"}, "base='mappo:weights=none' is not allowed: a filter"),
-        ({"feedback": 2.0}, "feedback=2.0 is not allowed: a share in [0, 1]"),
+        ({"feedback": 2.0}, "feedback=2.0 is not allowed: a number from 0 to 1"),
         ({"recurrent": "yes"}, "recurrent='yes' is not allowed: true or false is needed"),
         ({"scenario": "indor-v0"}, "unknown scenario 'indor-v0' (did you mean 'indoor-v0'?)"),
         ({"scenario": f"{SCENARIO}:failure_rate=0.1"}, "UAVs that fail do not fit rows of one UAV"),

@@ -12,6 +12,7 @@ from agents.particle.corrector import WeightCorrector
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
+from training.evaluation.record import record
 from training.learning import pfnn_online
 from training.learning import run as runs
 from training.learning.collectors import episode_collector, world_seed
@@ -155,8 +156,8 @@ def test_the_filter_flies_with_the_newest_weights(monkeypatch: pytest.MonkeyPatc
 def test_learning_online_meets_the_worlds_of_evaluation() -> None:
     scenario = make_scenario("indoor-v0", n_uavs=2, horizon=10)
     found = learn_online(scenario, 2, 4, quiet, correction=(1.0, 1.0))
-    alone = play(make("apf", scenario), scenario, torch.tensor([4, 5]), lambda steps: None)
-    torch.testing.assert_close(found.error, alone.error, atol=1e-5, rtol=0)
+    alone = record(make("apf", scenario), scenario, torch.tensor([4, 5]))
+    torch.testing.assert_close(found.error, torch.from_numpy(alone.error), atol=1e-5, rtol=0)
 
 
 def test_worlds_of_different_epochs_and_seeds_differ() -> None:
@@ -173,7 +174,7 @@ def test_worlds_of_different_epochs_and_seeds_differ() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "worlds=0 is not allowed: 1 to"),
+        ({"worlds": 0}, "worlds=0 is not allowed: a whole number"),
         ({"learning_rate": 0.0}, "learning_rate=0.0"),
         ({"seed": -1}, "seed=-1"),
         ({"mode": "supervised"}, "one of offline, online"),

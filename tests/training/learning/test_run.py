@@ -275,7 +275,7 @@ def test_weights_that_are_nan_are_an_error(tmp_path: Path, monkeypatch: pytest.M
     error = pfnn.CorrectorLoss.error
     monkeypatch.setattr(pfnn.CorrectorLoss, "error", lambda *given: error(*given) * torch.nan)
     with pytest.raises(ValueError, match=r"hidden.weight is NaN or infinite after training"):
-        runs.start("pfnn", SMALL, tmp_path / "run", quiet)
+        runs.start("pfnn", {**SMALL, "epochs": 1}, tmp_path / "run", quiet)
     assert not (tmp_path / "run/pfnn.safetensors").exists()
 
 

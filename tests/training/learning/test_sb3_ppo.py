@@ -16,6 +16,7 @@ from torch import Tensor
 from agents import make
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
+from training.evaluation.record import record
 from training.learning import run as runs
 from training.learning import sb3_ppo
 from training.learning.collectors import world_seed
@@ -189,24 +190,24 @@ def test_card_and_scores(tmp_path: Path) -> None:
     scenario = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3)
     agent = make(f"sb3-ppo:weights={weights}", scenario)
     assert isinstance(agent, PolicyAgent)
-    recorded = play(agent, scenario, torch.arange(2), lambda steps: None)
-    expected = float(recorded.error.square().mean().sqrt())
+    recorded = record(agent, scenario, torch.arange(2))
+    expected = float(np.sqrt(np.square(recorded.error).mean()))
     assert found["sb3-ppo"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "sb3-ppo: worlds=0 is not allowed: 1 to"),
-        ({"steps": 0}, "sb3-ppo: steps=0 is not allowed: 1 to"),
+        ({"worlds": 0}, "sb3-ppo: worlds=0 is not allowed: a whole number"),
+        ({"steps": 0}, "sb3-ppo: steps=0 is not allowed: a whole number"),
         ({"steps": 4}, "sb3-ppo: steps=4 must divide the horizon, 10"),
         ({"minibatches": 31}, "sb3-ppo: minibatches=31 is not allowed: at most 30"),
-        ({"learning_rate": 0.0}, "sb3-ppo: learning_rate=0.0 is not allowed: more than 0"),
-        ({"clip": 0.0}, "sb3-ppo: clip=0.0 is not allowed: more than 0"),
-        ({"gamma": 1.1}, "sb3-ppo: gamma=1.1 is not allowed: a number in [0, 1]"),
+        ({"learning_rate": 0.0}, "sb3-ppo: learning_rate=0.0 is not allowed: a number > 0"),
+        ({"clip": 0.0}, "sb3-ppo: clip=0.0 is not allowed: a number > 0"),
+        ({"gamma": 1.1}, "sb3-ppo: gamma=1.1 is not allowed: a number from 0 to 1"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
         ({"base": "sb3-ppo:weights=none"}, "base='sb3-ppo:weights=none' is not allowed: a filter"),
-        ({"feedback": -1.0}, "feedback=-1.0 is not allowed: a share in [0, 1]"),
+        ({"feedback": -1.0}, "feedback=-1.0 is not allowed: a number from 0 to 1"),
         ({"variants": "nlos=0.3"}, "sb3-ppo: unknown option 'variants'"),
         ({"recurrent": True}, "sb3-ppo: unknown option 'recurrent'"),
         ({"scenario": f"{SCENARIO}:failure_rate=0.1"}, "UAVs that fail do not fit rows of one UAV"),
