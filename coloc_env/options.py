@@ -36,7 +36,7 @@ class Quantity:
 
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
-        sane = abs(value) <= _MOST or (self.infinite and math.isinf(value))
+        sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
         return sane and self.least <= value <= self.most and value > self.above
 
     def words(self) -> str:
