@@ -44,7 +44,7 @@ VARIANTS = (
     "prior=uniform",
     "nlos=0.3",
     "nlos=0.15:nlos_bias=0.5:motion=random",
-    "nlos=0.3:landmarks_off=5,25:horizon=300",
+    "nlos=0.3:range_only=5,25:horizon=300",
     "false_matches=0.1",
     "nlos=0.3:false_matches=0.1:landmark_dropout=0.5:motion=random",
     "landmarks=5:horizon=300",
