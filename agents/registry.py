@@ -89,14 +89,14 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
     One that uses whatever has a measurement model goes on without a sensor that has none, as long
     as something is left to use, and warns of it.
     """
-    from agents.models.measurements import MODELS
+    from agents.models.measurements import model_of
 
     ignored = _ignored(factory, believed)
     if not ignored:
         return
     measuring = [sensor for sensor in believed.sensors if sensor.informs]
     general = getattr(factory, "serves", None) is None
-    if general and any(type(sensor) in MODELS for sensor in measuring):
+    if general and any(model_of(type(sensor)) for sensor in measuring):
         warnings.warn(
             f"{name}: {', '.join(ignored)} has no measurement model and is not used "
             "(agents.models.measurements.measures registers one)",

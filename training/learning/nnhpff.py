@@ -41,7 +41,7 @@ FAILED = 0.5  # m: an estimate farther off has failed
 # Low, medium and high: the team's beliefs of the acceleration (m²/s⁴) and of ranges (m²), and the
 # number of particles. Lowest and highest are those of the cases 1 to 3.
 _Q, _R, _PARTICLES = (0.0036, 0.06, 1.0), (0.0016, 0.04, 0.36), (500, 2000, 5000)
-VARIANTS = "/".join(f"q={q:g}:r_believed={r:g}" for q, r in product(_Q, _R))
+VARIANTS = "/".join(f"q={q:g}:believed_uwb_std={r**0.5:g}" for q, r in product(_Q, _R))
 MAINS = "/".join(f"pf:particles={count}" for count in _PARTICLES)
 
 

@@ -58,7 +58,7 @@ VARIANTS = (
     "n_uavs=100:comm_radius=3500:nlos=0.3:motion=line",
     "n_uavs=150:comm_radius=2500",
     "n_uavs=150:comm_radius=2500:ins_bias=0:nlos=0.3:nlos_time=10",
-    "n_uavs=100:comm_radius=2200:anchors=0.25:motion=circle",
+    "n_uavs=100:comm_radius=2200:anchor_share=0.25:motion=circle",
     "n_uavs=150:comm_radius=1400",
     "n_uavs=120:comm_radius=1800:nlos=0.3",
 )
@@ -99,7 +99,7 @@ class StDclLoss(LossModule):
         train = tensordict["train"]
         variant = int(train["variant"][0, 0])
         loop, scenario, scale = self.loops[variant], self.scenarios[variant], self.scales[variant]
-        n, d, free = scenario.arena.n_uavs, scenario.arena.dim, slice(scenario.guides, None)
+        n, d, free = scenario.arena.n_uavs, scenario.arena.dim, slice(scenario.anchor_uavs, None)
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
         observed = tensordict["uav", "observation"]
         leaves = tuple(all_leaves(scenario))

@@ -31,7 +31,7 @@ from training.learning.registry import TRAININGS
 # Beliefs that a filter with few particles sometimes survives.
 SMALL: dict[str, Any] = {
     "scenario": "wsn-v0:horizon=40",
-    "variants": "case=1/q=0.0036:r_believed=0.0016",
+    "variants": "case=1/q=0.0036:believed_uwb_std=0.04",
     "mains": "pf:particles=60",
     "worlds": 1,
     "epochs": 2,

@@ -32,7 +32,7 @@ from training.learning.registry import TRAININGS
 from training.learning.stdcl import StDclLoss, far_off
 
 SMALL: dict[str, Any] = {
-    "scenario": "swarm-v0:n_uavs=12:anchors=0.4:horizon=10:comm_radius=9000",
+    "scenario": "swarm-v0:n_uavs=12:anchor_share=0.4:horizon=10:comm_radius=9000",
     "variants": "/nlos=0.3:n_uavs=10",
     "worlds": 1,
     "epochs": 2,
@@ -53,7 +53,7 @@ def quiet(what: str, done: int, total: int) -> None:
 def recorded() -> SimpleNamespace:
     """Four steps of two worlds as a training meets them, in the second batch of an episode."""
     torch.set_num_threads(1)
-    scenario = make_scenario("swarm-v0", n_uavs=12, anchors=0.4, horizon=8, nlos=0.4)
+    scenario = make_scenario("swarm-v0", n_uavs=12, anchor_share=0.4, horizon=8, nlos=0.4)
     network = untrained(StGnn, 0).double()
     generator = torch.Generator().manual_seed(0)
     for weight in network.parameters():
@@ -77,7 +77,7 @@ def test_the_loop_is_run_again(recorded: SimpleNamespace) -> None:
     found = recorded.loss(recorded.batch)["loss_position"]
     state = recorded.batch["state"].unflatten(-1, (12, -1)).double()
     action = recorded.batch["uav", "action"][..., :3].double()
-    free = slice(recorded.scenario.guides, None)
+    free = slice(recorded.scenario.anchor_uavs, None)
     squared = (action - state[..., :3])[:, :, free].square().sum(-1)
     assert float(found.detach()) == pytest.approx(float(far_off(squared, 5.0).mean()), rel=1e-3)
 
@@ -136,7 +136,7 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
             owed = loops._owed(belief, now, scene, off)
         return found.position.detach() + owed, state
 
-    free = slice(recorded.scenario.guides, None)
+    free = slice(recorded.scenario.anchor_uavs, None)
     plain, _ = next_place(0.0, 0.0, False)
     there, state = next_place(0.0, 0.0, True)
     assert torch.equal(there.detach(), plain)
