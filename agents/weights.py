@@ -1,6 +1,6 @@
 """Checkpoints: the weights of learned parts, NAME.safetensors beside NAME.json, its card.
 
-The card says what the weights are for (``kind``, ``features``), the SHA-256 of their file, and how
+The card holds what the weights are for (``kind``, ``features``), the SHA-256 of their file, and how
 they were trained. Nothing is ever executed by loading: safetensors holds numbers only.
 """
 
@@ -107,9 +107,9 @@ def card_of(source: str | Path) -> dict[str, Any]:
 def write(weights: Path, module: Learned, trained: Mapping[str, Any]) -> None:
     """Write ``weights`` (NAME.safetensors) and its card NAME.json.
 
-    ``trained``: what the card says of how the weights came to be; a number that is NaN or infinite
+    ``trained``: what the card records of the training; a number that is NaN or infinite
     becomes null. Both files are complete before
-    either gets its name; should only one get it, the hashes differ and loading says so.
+    either gets its name; should only one get it, the hashes differ and loading refuses them.
     """
     data = serialized({name: value.contiguous() for name, value in module.state_dict().items()})
     card = {

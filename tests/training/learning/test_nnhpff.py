@@ -295,7 +295,9 @@ def test_card_and_weights(unbroken: Path) -> None:
 
 
 def test_scores_are_those_of_the_three_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "scenario_of", lambda text: parse_scenario(f"{text}:horizon=4"))
+    monkeypatch.setattr(
+        training, "parse_scenario", lambda text: parse_scenario(f"{text}:horizon=4")
+    )
     reported: list[int] = []
     detector = untrained(FailureDetector, 0)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 
 from agents import make
 from agents.policies.adapters import LocalizerPolicy
-from agents.stdcl import stdcl as loops
+from agents.stdcl import loop as loops
 from agents.stdcl.network import StGnn
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
