@@ -5,12 +5,14 @@ The data are their owners' and not part of this package: see ``coloc_env.dataset
 """
 
 from functools import lru_cache
+from math import isnan
 from typing import Any
 
 import numpy as np
 
 from coloc_env.datasets import Recording, load
 from coloc_env.datasets.euroc import room
+from coloc_env.datasets.folders import Version, dataset_folder, version
 from coloc_env.datasets.grid import Grid
 from coloc_env.datasets.recording import Floats
 from coloc_env.scenario import Inertial
@@ -36,8 +38,8 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
     """The part of a recording from ``span[0]`` to ``span[1]`` s after its common start."""
     if span is None:
         return grid
-    first, last = (round(s / grid.dt) for s in span)
-    last = min(last, grid.count - 1)
+    first, last = (min(s / grid.dt, grid.count - 1.0) for s in span)
+    first, last = (-1 if isnan(s) else round(max(s, -1.0)) for s in (first, last))
     if not 0 <= first < last:
         raise ValueError(
             f"span={span} is not allowed: (from, to) in s within 0 and {grid.count * grid.dt:.1f}"
@@ -45,7 +47,15 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
     return Grid(int(grid.times[first]), grid.dt, last - first + 1)
 
 
-@lru_cache(maxsize=4)
 def loaded(name: str, sequence: str | None, data: str | None, **options: Any) -> Recording:
-    """A recording, kept for the next scenario made of it."""
+    """A recording, kept for the next scenario made of it as long as no file of its dataset changes.
+    """
+    known = version(dataset_folder(name, data))
+    return _loaded(known, name, sequence, data, **options)
+
+
+@lru_cache(maxsize=4)
+def _loaded(
+    known: Version, name: str, sequence: str | None, data: str | None, **options: Any
+) -> Recording:
     return load(name, sequence, data, **options)

@@ -128,7 +128,9 @@ def replay_murp(
     odometry, reference = Odometry(slip, slip, turn), Reference()
     matches = RelativePose(len(found.pairs), std, turn_std)
     drawn = RelativePose(len(found.pairs), std, turn_std, outliers)
-    measured = RecordedPoses(drawn, found.pairs, Tape(found.pose[at]), Tape(found.there[at]))
+    measured = RecordedPoses(
+        drawn, found.pairs, Tape(found.pose[at]), Tape(found.there[at]), dict(recording.dropped)
+    )
     return Scenario(
         name="replay-murp-v0",
         arena=arena_of(recording, grid, margin=0.5),

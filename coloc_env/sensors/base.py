@@ -74,6 +74,10 @@ class Sensor(ABC):
     informs: ClassVar[bool] = True
     """Whether its leaves tell of where UAVs are (a frame that estimates are stated in does not)."""
 
+    may_be_blind: ClassVar[bool] = True
+    """Whether it measures nothing at steps at which the truth is not known (what is recorded, and
+    what drives a motion model, is there at every step)."""
+
     @property
     def delay(self) -> int:
         """Steps between sensing and delivery."""
@@ -121,12 +125,17 @@ class Sensor(ABC):
 class Recorded(Sensor):
     """A sensor whose samples come from a recording: step k delivers ``tape[leaf][k]``.
 
-    ``sensor`` describes the leaves; each tape is float32 [T, N, F]; maps are [F].
+    ``sensor`` describes the leaves; each tape is float32 [T, N, F]; maps are [F]. ``dropped``: by
+    the recording's stream, how many measurements were left out, since no sensor can have given
+    them.
     """
+
+    may_be_blind = False
 
     sensor: Sensor
     tape: dict[str, Tape]
     maps: dict[str, Tensor] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)

@@ -1,7 +1,7 @@
 """Relative poses between UAVs, as matches of what their cameras see give them: some are wrong."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -88,10 +88,13 @@ class RecordedPoses(Sensor):
     of what is recorded.
     """
 
+    may_be_blind = False
+
     sensor: RelativePose
     pairs: tuple[tuple[int, int], ...]
     poses: Tape
     there: Tape
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)
