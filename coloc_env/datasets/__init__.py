@@ -9,7 +9,7 @@ from typing import Any
 
 from coloc_env.datasets import euroc, hanyang, miluv, mrclam, murp, tiers, tuc
 from coloc_env.datasets.euroc import load_euroc
-from coloc_env.datasets.folders import data_root, dataset_folder, entries, natural
+from coloc_env.datasets.folders import data_root, dataset_folder, entries
 from coloc_env.datasets.hanyang import load_hanyang
 from coloc_env.datasets.miluv import load_miluv
 from coloc_env.datasets.mrclam import load_mrclam

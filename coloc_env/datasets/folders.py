@@ -65,7 +65,7 @@ def version(folder: Path) -> Version:
     """Path, size and modification time (ns) of every file below that a loader may read: another
     version has other recordings."""
     found = []
-    for path, folders, names in os.walk(folder, followlinks=True):
+    for path, folders, names in os.walk(folder.resolve(), followlinks=True):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in names:
             if name.endswith(_READ):

@@ -2,8 +2,8 @@
 
 Step k is at ``start + k dt``. Nothing measured is interpolated or invented: a step delivers what
 arrived in (t_{k−1}, t_k]; what drives a motion model (IMU, odometry) is integrated over that
-interval exactly, each sample held until the next. An IMU's sample is held for 0.1 s at most: beyond,
-its mean stands for it, and how wrong that may be is given with it.
+interval exactly, each sample held until the next. An IMU's sample is held for 0.1 s at most: beyond
+that its mean stands for it, and how wrong that may be is given with it.
 """
 
 from dataclasses import dataclass

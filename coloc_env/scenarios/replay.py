@@ -5,7 +5,6 @@ The data are their owners' and not part of this package: see ``coloc_env.dataset
 """
 
 from functools import lru_cache
-from math import isnan
 from typing import Any
 
 import numpy as np
@@ -38,8 +37,7 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
     """The part of a recording from ``span[0]`` to ``span[1]`` s after its common start."""
     if span is None:
         return grid
-    first, last = (min(s / grid.dt, grid.count - 1.0) for s in span)
-    first, last = (-1 if isnan(s) else round(max(s, -1.0)) for s in (first, last))
+    first, last = (round(max(-1.0, min(s / grid.dt, grid.count - 1.0))) for s in span)
     if not 0 <= first < last:
         raise ValueError(
             f"span={span} is not allowed: (from, to) in s within 0 and {grid.count * grid.dt:.1f}"
@@ -48,8 +46,7 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
 
 
 def loaded(name: str, sequence: str | None, data: str | None, **options: Any) -> Recording:
-    """A recording, kept for the next scenario made of it as long as no file of its dataset changes.
-    """
+    """A recording, kept for the next scenario made of it as long as no file of its dataset changes."""
     known = version(dataset_folder(name, data))
     return _loaded(known, name, sequence, data, **options)
 

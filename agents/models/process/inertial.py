@@ -127,7 +127,9 @@ class InertialProcess(Process):
         f = torch.eye(e, dtype=torch.float64)
         eye = torch.eye(3, dtype=torch.float64)
         f[:3, 3:6] = h * eye
-        q = self.strapdown_noise(*torch.tensor([self.imu.accel_std, self.imu.gyro_std], dtype=torch.float64))
+        q = self.strapdown_noise(
+            *torch.tensor([self.imu.accel_std, self.imu.gyro_std], dtype=torch.float64)
+        )
         if self.biased:
             f[6:9, 12:15] = -h * eye
             q[9:12, 9:12] = self.settings.accel_walk**2 * h * eye
