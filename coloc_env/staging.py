@@ -19,6 +19,8 @@ def staged_folder(out: Path, names: Sequence[str]) -> Iterator[Path]:
     them, which marks such a folder (then they are somebody else's).
     """
     out = out.absolute()
+    if out.is_symlink() and not out.exists():
+        raise ValueError(f"{out} is a link to nothing")
     if out.exists():
         if not out.is_dir():
             raise ValueError(f"{out} is not a folder")

@@ -46,7 +46,7 @@ def cut(grid: Grid, span: tuple[float, float] | None) -> Grid:
 
 
 def loaded(name: str, sequence: str | None, data: str | None, **options: Any) -> Recording:
-    """A recording, kept for the next scenario made of it as long as no file of its dataset changes."""
+    """A recording, kept for the next scenario made of it until a file of its dataset changes."""
     known = version(dataset_folder(name, data))
     return _loaded(known, name, sequence, data, **options)
 

@@ -23,7 +23,7 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 from agents.weights import SUFFIX, Learned
 from coloc_env import options
 from coloc_env.staging import staged_folder
-from training.evaluation.results import typed
+from training.evaluation.tables import typed
 from training.learning import checkpoints
 from training.learning import state as savepoints
 from training.learning.collectors import Flights

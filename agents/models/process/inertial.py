@@ -48,7 +48,8 @@ class InertialProcess(Process):
         imu = observation["imu"].double()
         if "imu_unknown" not in observation:
             return imu
-        return torch.cat((imu, observation["imu_unknown"].double()), -1)
+        unknown = observation["imu_unknown"].double().expand(*imu.shape[:-1], -1)
+        return torch.cat((imu, unknown), -1)
 
     def propagate(
         self,
