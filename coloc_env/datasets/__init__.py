@@ -46,7 +46,7 @@ class _Dataset:
 
 
 def _folders(robots_in: Callable[[Path], tuple[Any, ...]]) -> Callable[[Path], dict[str, int]]:
-    """A folder per sequence, which ``robots_in`` tells from others."""
+    """A folder per sequence, in which ``robots_in`` finds robots."""
 
     def sequences_in(home: Path) -> dict[str, int]:
         folders = [path for path in entries(home) if path.is_dir()]

@@ -82,7 +82,7 @@ def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
 
 
 def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
-    """What a stream says over each step: samples [T, S, F] and for how long each holds [T, S] (s).
+    """A stream over each step: samples [T, S, F] and for how long each holds [T, S] (s).
 
     Sample i holds from its time to the next one's; step k covers (t_{k−1}, t_k], step 0 nothing.
     """

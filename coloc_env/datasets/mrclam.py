@@ -62,7 +62,9 @@ def load_mrclam(folder: str | os.PathLike[str]) -> Recording:
 
     tracks = [read(folder / f"{robot}_Groundtruth.dat", _TRUTH) for robot in robots]
     zero = min(rows.time[0] for rows in tracks)
-    odometry, landmark_bearings, uav_bearings = [], [], []
+    odometry: list[Table] = []
+    landmark_bearings: list[Table] = []
+    uav_bearings: list[Table] = []
     dropped = {"landmark_bearings": 0, "uav_bearings": 0}
     for robot in robots:
         wheels = read(folder / f"{robot}_Odometry.dat", _ODOMETRY)

@@ -80,7 +80,7 @@ class Evaluation:
 
     @cached_property
     def reference(self) -> Floats | None:
-        """What the scenario's reference says less the truth [R, K, N, d], m; None without one."""
+        """The scenario's reference less the truth [R, K, N, d], m; None without one."""
         if self.scenario.reference is None:
             return None
         seeds = torch.arange(self.seed, self.seed + self.runs)

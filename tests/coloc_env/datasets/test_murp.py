@@ -66,8 +66,8 @@ def test_what_is_read(tmp_path: Path) -> None:
         assert track.position.tolist() == [[agent, 2 * agent, 0.5], [agent + 1, 2 * agent, 0.5]]
         roll, pitch, yaw = ANGLES[agent]
         turned = Rotation.from_euler("ZYX", (yaw, pitch, roll), degrees=True)
-        told = Rotation.from_quat(track.attitude, scalar_first=True)
-        assert (turned.inv() * told).magnitude().max() < 1e-12
+        stated = Rotation.from_quat(track.attitude, scalar_first=True)
+        assert (turned.inv() * stated).magnitude().max() < 1e-12
     np.testing.assert_allclose(recording.tags[1, 1], (0, 0.32, 0), atol=1e-12)
     np.testing.assert_allclose(recording.tags[2, 5], (0.2771, -0.16, 0), atol=1e-4)
 
