@@ -125,7 +125,7 @@ def test_a_robot_without_sightings(tmp_path: Path) -> None:
     grid = common_grid(recording, 0.1, ())
     seen, depth = recorded_bearings(recording, grid, LandmarkBearings(2))
     assert depth == 1
-    assert seen.tape["landmark_bearing_mask"].values[:, 1].sum() == 0
+    assert seen.series["landmark_bearing_mask"].values[:, 1].sum() == 0
 
 
 @pytest.mark.parametrize("value", ["-1", "0", "nan", "inf", "-inf", "1e308", "1e400", "20.5"])

@@ -107,10 +107,9 @@ def test_output_is_checked_before_anything_is_computed(
     assert done.stderr == f"error: {tmp_path / 'file'} is not a folder\n"
     done = coloc("render", "indoor-v0", "--out", tmp_path / "file" / "a.gif")
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "link").symlink_to(tmp_path / "file" / "nowhere")
     done = evaluate(tmp_path / "link", "--agents", "ekf")
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert "is a link to nothing" in done.stderr
+    assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     if os.geteuid():  # root may write anywhere
         (tmp_path / "closed").mkdir(mode=0o500)
         done = evaluate(tmp_path / "closed", "--agents", "ekf")

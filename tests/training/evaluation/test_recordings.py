@@ -21,7 +21,6 @@ from training.evaluation.files import write
 from training.evaluation.results import Evaluation
 
 SECOND = 1_000_000_000
-Change = Callable[[Recording], Recording]
 
 
 @pytest.fixture(autouse=True)
@@ -130,23 +129,23 @@ def moved(recording: Recording, by: tuple[float, ...]) -> Recording:
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Recording], None]:
-    """Lets a scenario replay a recording of the test's."""
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Recording], None]:
+    """Lets scenarios replay a recording of the test's."""
 
-    def use(scenario: str, recording: Recording) -> None:
-        module = f"coloc_env.scenarios.{scenario}"
-        monkeypatch.setattr(f"{module}.loaded", lambda *_, **__: near_origin(recording))
+    def use(recording: Recording) -> None:
+        module = "coloc_env.scenarios.parts.replays"
+        monkeypatch.setattr(f"{module}._loaded", lambda *_, **__: near_origin(recording))
 
     return use
 
 
 def test_map_coordinates_keep_their_digits(
-    recorded: Callable[[str, Recording], None], tmp_path: Path
+    recorded: Callable[[Recording], None], tmp_path: Path
 ) -> None:
     folder_of("tuc")
     near = run("replay-tuc-v0")
     utm = (353_017.25, 5_634_012.5)
-    recorded("replay_tuc", moved(load("tuc"), utm))
+    recorded(moved(load("tuc"), utm))
     far = run("replay-tuc-v0")
     assert far.origin.tolist() == [353_000.0, 5_634_000.0]
     assert rmse(far) == pytest.approx(rmse(near), rel=0.01)
@@ -184,12 +183,12 @@ def holed(recording: Recording, truth: tuple[int, int] | None, imu: tuple[int, i
 
 @pytest.mark.parametrize(("truth", "imu", "limit"), [((20, 23), None, 1.1), (None, (20, 23), 1.3)])
 def test_holes_are_not_filled_with_inventions(
-    truth: Any, imu: Any, limit: float, recorded: Callable[[str, Recording], None]
+    truth: Any, imu: Any, limit: float, recorded: Callable[[Recording], None]
 ) -> None:
     folder_of("euroc")
     recording, span = load("euroc"), (15.0, 30.0)
     whole = run("replay-euroc-v0", span=span)
-    recorded("replay_euroc", holed(recording, truth, imu))
+    recorded(holed(recording, truth, imu))
     results = run("replay-euroc-v0", span=span)
     assert rmse(results) < limit * rmse(whole)
     (metrics,), (before,) = (one.summary["agents"].values() for one in (results, whole))
