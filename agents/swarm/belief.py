@@ -91,7 +91,7 @@ class Solution:
     delays: Delays | None = None
 
     def residual(self, inputs: StepInput) -> Float64[Tensor, "B N N"]:
-        """d̃_ij − ‖p_i − p_j‖ (m), less what was learned of the delays in this step."""
+        """d̃_ij − ‖p_i − p_j‖ (m), less this step's correction of the delays."""
         residual = inputs.links.distance - lengths(self.position.detach())
         if self.delays is None:
             return residual

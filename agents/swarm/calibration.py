@@ -1,8 +1,8 @@
-"""What ranges' errors look like, em_update from links whose length is known.
+"""Calibration: a mixture model of range errors, fitted by EM to links of known length.
 
 Huber's loss cannot remove a bias that has one sign. Between anchors the error of a range is known;
-two Gaussians, N(0, σ²) and N(b, s²) with share π, are fitted to those errors by EM, and every other
-link gets the weight and the shift that its own residual makes likely.
+the mixture (1 − π) N(0, σ²) + π N(b, s²) of line-of-sight and NLOS errors is fitted to those errors
+by EM, and every other link gets a weight and a shift by the responsibilities at its own residual.
 """
 
 import math

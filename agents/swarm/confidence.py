@@ -1,4 +1,4 @@
-"""Kinds of confidence in links: how ranges are weighted, and what is learned of their errors.
+"""Kinds of confidence in links: weights of ranges, and estimation of their errors.
 
 Equation 19 of ST-DCL weights each squared residual by W_ij = w(τ) c_ij. A kind of confidence gives
 the weights, shifts of the ranges, the information that a range then has, and what is remembered of

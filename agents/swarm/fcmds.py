@@ -1,6 +1,6 @@
 """Multidimensional scaling of a network made fully connected (FC-MDS).
 
-The ST-DCL paper gives no formulas, and the text that we have lacks its bibliography. What it says:
+The ST-DCL paper gives no formulas, and the text that we have lacks its bibliography. It says:
 the network is taken as fully connected, missing distances replaced by shortest paths; all links
 count alike; and maps are refined iteratively (sections 2.1 and 5.3). This is our reading of that.
 """

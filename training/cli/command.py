@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 from training.cli.reproduce import reproduce
 from training.cli.terminal import explain, progress, show
 from training.cli.train import train
+from training.threads import use_threads
 
 if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
@@ -221,17 +222,13 @@ app.command()(reproduce)
 
 def _scenario(name: str, settings: list[str] | None, threads: int, data: Path | None) -> "Scenario":
     """Prepare the process, and build a scenario from a command line."""
-    if threads < 1:
-        raise ValueError(f"--threads {threads} is not allowed: at least 1")
+    use_threads(threads)
     if data is not None:
         os.environ["COLOC_DATA"] = str(data)
     from dataclasses import replace
 
-    import torch
-
     from coloc_env.scenarios import make_scenario, parse_override
 
-    torch.set_num_threads(threads)
     overrides = dict(parse_override(name, text) for text in settings or ())
     return replace(make_scenario(name, **overrides), overrides=overrides)
 

@@ -59,10 +59,12 @@ def evaluate(
 
 def split_agents(text: str) -> list[str]:
     """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
-    option before (``apf:bounds=100,800``)."""
+    option before (``apf:bounds=100,800``), and so does a piece of a path (``weights=a,b/c``)."""
     names: list[str] = []
     for piece in text.split(","):
-        if names and piece[:1] in set("0123456789+-."):
+        head = piece.partition("=")[0]
+        path = "/" in head or ".safetensors" in head
+        if names and (path or piece[:1] in set("0123456789+-.")):
             names[-1] += f",{piece}"
         elif piece.strip():
             names.append(piece.strip())

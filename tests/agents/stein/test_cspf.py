@@ -13,6 +13,7 @@ from agents import make
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
+from training.evaluation.team import team_figures
 
 STRANGER = 1
 

@@ -14,7 +14,7 @@ from coloc_env.world import World
 from training.evaluation.evaluate import evaluate
 from training.evaluation.metrics import rmse
 
-SMALL: dict[str, Any] = {"n_uavs": 40, "anchors": 0.25, "ins_bias": 0.0, "horizon": 25}
+SMALL: dict[str, Any] = {"n_uavs": 40, "anchor_share": 0.25, "ins_bias": 0.0, "horizon": 25}
 PAPERS = "dwmds_st:confidence=paper:v_max=50"
 METHODS = ("dwmds_st", "dwmds_st:window=3", PAPERS, "gn", "map", "mds")
 
@@ -111,7 +111,7 @@ def test_a_world_that_restarts_disturbs_no_other(agent: str) -> None:
     [
         {"comm_radius": 1.0},  # nobody hears anybody
         {"comm_radius": 1500.0},  # in pieces, some without an anchor
-        {"anchors": 0.0},
+        {"anchor_share": 0.0},
         {"link_failure": 1.0},
         {"failure_rate": 1.0, "horizon": 4},
     ],
@@ -136,7 +136,7 @@ def test_without_links_they_dead_reckon_with_its_covariance(agent: str) -> None:
 
 @pytest.mark.parametrize("agent", ["dwmds_st", "map"])
 def test_without_anchors_the_mean_position_is_dead_reckoned(agent: str) -> None:
-    scenario = make_scenario("swarm-v0", **SMALL | {"anchors": 0.0, "n_uavs": 12})
+    scenario = make_scenario("swarm-v0", **SMALL | {"anchor_share": 0.0, "n_uavs": 12})
     localizer, world = make(agent, scenario), World(scenario, 1)
     observation = world.reset(2)
     belief = localizer.reset(observation)
@@ -221,7 +221,7 @@ def test_an_exact_prior_is_kept(agent: str, family: str) -> None:
 @pytest.mark.parametrize("agent", ["dwmds_st", "map", "stdcl:weights=none"])
 def test_a_moved_belief_is_the_belief_of_a_moved_position(agent: str) -> None:
     """Without links the estimate follows the correction, and nothing else of it changes."""
-    scenario = make_scenario("swarm-v0", **SMALL | {"comm_radius": 1.0, "anchors": 0.0})
+    scenario = make_scenario("swarm-v0", **SMALL | {"comm_radius": 1.0, "anchor_share": 0.0})
     localizer, world = make(agent, scenario), World(scenario, 1)
     observation = world.reset(0)
     belief, _ = localizer.step(localizer.reset(observation), observation)

@@ -162,7 +162,7 @@ def test_figures_that_do_not_apply_are_null() -> None:
 
 def test_errors_are_measured_from_the_reference_too() -> None:
     """A UAV that says just what its reference does has no error from it; the truth has."""
-    scene = make_scenario("campus-v0", n_uavs=4, anchors=0.0, horizon=8, gps_cep=2.0)
+    scene = make_scenario("campus-v0", n_uavs=4, anchor_share=0.0, horizon=8, gps_cep=2.0)
     results = evaluate(scene, ["dead_reckoning"], runs=2, seed=5, bound=False)
     (agent,) = results.agents.values()
     assert results.reference is not None
