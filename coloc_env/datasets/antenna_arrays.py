@@ -25,7 +25,7 @@ def relative_poses(
     """Poses T of one array (second ``arms``) in the body frame of another (first), and their
     covariances in the tangent [ρ, φ] at T, from K sets of ranges r_ij = ‖T b_j − a_i‖ + noise.
 
-    Arrays in the plane z = 0 of their bodies cannot show which side of that plane the other is on:
+    Arrays in the plane z = 0 of their bodies do not show which side of that plane the other is on:
     T and its mirror image M T M, M = diag(1, 1, −1), have the very same ranges; and of an array
     near the plane, neither its height nor how both are tilted shows. So two things more are given:
     how far ``above`` the first the second is (m, with ``above_std``), and that both are level
@@ -80,7 +80,7 @@ def _normal_equations(
     weighted = flat * weight.flatten(1).unsqueeze(-1)
     information = weighted.mT @ flat
     gradient = (weighted.mT @ residual.flatten(1).unsqueeze(-1))[..., 0]
-    # Told beside the ranges: the height, and where the other's z axis points, R e_z = e_z.
+    # Given beside the ranges: the height, and where the other's z axis points, R e_z = e_z.
     axis = pose.new_tensor((0.0, 0.0, 1.0))
     raised = concat((rotation[:, 2], torch.zeros_like(rotation[:, 2]))).unsqueeze(1) / above_std
     tilted = (-rotation @ cross_matrix(axis))[:, :2] / tilt_std

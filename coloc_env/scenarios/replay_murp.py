@@ -52,7 +52,8 @@ def replay_murp(
     odometry, reference = Odometry.of_steps(odometry_noise, DT), Reference()
     matches = RelativePose(len(found.pairs), std, turn_std)
     drawn = RelativePose(len(found.pairs), std, turn_std, outliers)
-    measured = RecordedPoses(drawn, found.pairs, Series(found.pose[at]), Series(found.there[at]))
+    poses, there = Series(found.pose[at]), Series(found.there[at])
+    measured = RecordedPoses(drawn, found.pairs, poses, there, dict(recording.dropped))
     return Scenario(
         name="replay-murp-v0",
         arena=arena_of(recording, grid, margin=0.5),

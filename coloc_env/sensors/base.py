@@ -77,6 +77,10 @@ class Sensor(ABC):
     between_uavs: ClassVar[bool] = False
     """Whether it ties UAVs together (as a range between two does, a range to an anchor not)."""
 
+    may_be_blind: ClassVar[bool] = True
+    """Whether it measures nothing at steps at which the truth is not known (what is recorded, and
+    what drives a motion model, is there at every step)."""
+
     @property
     def delay(self) -> int:
         """Steps between sensing and delivery."""
@@ -124,12 +128,17 @@ class Sensor(ABC):
 class RecordedSensor(Sensor):
     """A sensor whose samples come from a recording: step k delivers ``series[leaf][k]``.
 
-    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F].
+    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F]. ``dropped``: by
+    the recording's stream, how many measurements were left out, since no sensor can have given
+    them.
     """
+
+    may_be_blind = False
 
     sensor: Sensor
     series: dict[str, Series]
     maps: dict[str, Tensor] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)

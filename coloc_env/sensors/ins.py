@@ -33,6 +33,8 @@ class Ins(Sensor):
     over many draws; the sum of many is as good as Gaussian.
     """
 
+    may_be_blind = False
+
     std: float = 0.5
     bias: float = 0.0
     bias_time: float = 60.0

@@ -131,7 +131,7 @@ class LandmarkOptions(Group):
     """So many ``landmarks`` stand anywhere in the arena; those within ``landmark_radius`` m are
     seen as position vectors with noise of ``landmark_std`` m per axis. A share ``false_matches`` of
     these belongs to another landmark, a share ``landmark_dropout`` is missing, and in the times
-    ``landmarks_off`` (from, to) none is seen. The team believes the Gaussian part alone.
+    ``range_only`` (from, to) none is seen. The team believes the Gaussian part alone.
     """
 
     title: ClassVar[str] = "landmarks"
@@ -141,12 +141,12 @@ class LandmarkOptions(Group):
     landmark_radius: PositiveMetres = 10.0
     false_matches: Share = 0.0
     landmark_dropout: Share = 0.0
-    landmarks_off: tuple[Seconds, Seconds] | None = None
+    range_only: tuple[Seconds, Seconds] | None = None
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
         """The sensor as it is; nothing without landmarks."""
-        return self._seen(self.false_matches, self.landmark_dropout, self.landmarks_off)
+        return self._seen(self.false_matches, self.landmark_dropout, self.range_only)
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:

@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "dropouts": {"uwb_dropout": 0.3, "landmark_dropout": 0.3},
     "delay": {"uwb_delay": 2},
     "false matches": {"false_matches": 0.3},
-    "range only": {"landmarks_off": (0.3, 0.6)},
+    "range only": {"range_only": (0.3, 0.6)},
     "message loss": {"message_loss": 0.3},
     "message delay": {"message_delay": 2},
     "radius": {"comm_radius": 5.0, "motion": "random"},

@@ -712,7 +712,7 @@ def test_runs_are_the_worlds_of_their_seeds(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_masks_are_those_of_the_paired_worlds() -> None:
     """Without landmarks for a second the bound rises, and in each world as its own masks say."""
-    bound = indoor(steps=40, landmarks_off=(1.0, 2.0))
+    bound = indoor(steps=40, range_only=(1.0, 2.0))
     same = indoor(steps=40)
     torch.testing.assert_close(bound.mse[:, :10], same.mse[:, :10])
     assert (bound.mse[:, 19] > 1.2 * same.mse[:, 19]).all()
