@@ -105,7 +105,7 @@ def look(
     gain = torch.cholesky_inverse(root)
     error = (residual / std).clamp(-_CLIP, _CLIP)
     lasting = (memory.residual / std).clamp(-_CLIP, _CLIP) * mask
-    alike = std * mask / (std**2 + vague)
+    alike = std * mask.to(torch.float32) / (std**2 + vague)
     strengths = (
         certain * (residual - shift),
         alike * error.clamp(-_SOFT, _SOFT),

@@ -122,4 +122,4 @@ def _averaged(
     """One link for several ranges, each of which is worth a ``share`` of one; and its worth."""
     count = mask.sum(-1)
     mean = torch.where(mask, ranges, 0.0).sum(-1) / count.clamp_min(1)
-    return Links(mean, count > 0), share * count
+    return Links(mean, count > 0), share * count.to(torch.float32)

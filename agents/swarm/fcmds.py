@@ -57,7 +57,7 @@ class FullyConnectedMds(MdsMap):
         )
         y = repeated(refine, begins.position, belief.step, self.iterations, self.first)
         information = told(y, distance, weight, fixed, now.variance, self.std)
-        kept = together.sum(-1) / (RELAXED * self.iterations * self.std**2)
+        kept = together.sum(-1).to(torch.float32) / (RELAXED * self.iterations * self.std**2)
         return Found(y, spread(information, kept, begins.variance, fixed))
 
 

@@ -142,7 +142,8 @@ def left_by(
 def held(matrix: Float64[Tensor, "B K K"], still: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
     """A matrix of information in which what is ``still`` is tied to nothing and has 1 m⁻²."""
     matrix = matrix.masked_fill(_tied(still), 0.0)
-    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
+    added = torch.full_like(still, _NOTHING, dtype=torch.float32).masked_fill(still, 1.0)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(added)
     return matrix
 
 

@@ -21,7 +21,7 @@ def learned(now: Prepared, memory: Float64[Tensor, "B N N"], std: float, dense: 
     links = now.links
     guides = now.fixed.any(0).nonzero()[:, 0]
     known = links.mask & now.fixed.unsqueeze(-1) & now.fixed.unsqueeze(-2)
-    remembered = 0.5 * calibration.FORGET * known.sum((-2, -1))
+    remembered = 0.5 * calibration.FORGET * known.sum((-2, -1)).to(torch.float32)
     others = dense * (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
     if bool((others > 0).any()):
         guides = torch.arange(links.mask.shape[-1], device=guides.device)

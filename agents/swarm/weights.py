@@ -39,7 +39,7 @@ def papers(
     """ST-DCL's confidence of each link, clip(1 − 0.5 s − 0.3 ρ, c_min, 1) (equation 17): s whether
     its residual is flagged as NLOS, ρ how often the link was ``silent``."""
     flagged = residual > _FLAGGED * (std**2 + added).sqrt()
-    return (1 - _NLOS * flagged - _LOSS * silent).clamp(_LEAST, 1.0)
+    return (1 - _NLOS * flagged.to(torch.float32) - _LOSS * silent).clamp(_LEAST, 1.0)
 
 
 def calibrated(

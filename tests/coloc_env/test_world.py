@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.envs.actions import Estimates, check
+from coloc_env.envs.actions import Estimates, checked_tensor
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled
@@ -435,8 +435,8 @@ def test_wrong_arguments_are_named() -> None:
     world.reset(0)
     mode = Estimates(scenario.believed)
     with pytest.raises(ValueError, match=r"indoor-v0: actions of shape \(2, 6, 8\).*\(2, 6, 9\)"):
-        check(scenario, mode, torch.zeros(2, 6, 8), 2)
+        checked_tensor(scenario, mode, torch.zeros(2, 6, 8), 2)
     bad = torch.zeros(2, 6, 9)
     bad[1, 4, 2] = float("inf")
     with pytest.raises(ValueError, match="indoor-v0: the action of uav_4 in world 1 holds NaN"):
-        check(scenario, mode, bad, 2)
+        checked_tensor(scenario, mode, bad, 2)

@@ -7,8 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from coloc_env.envs.per_uav import PerUavEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 
 _TRAINING_WORLDS = 1 << 40  # far from the seeds that anyone evaluates with
 _PER_SEED = 1 << 24  # worlds that one training may fly

@@ -48,7 +48,7 @@ class Clock:
         self, window: Window, steps: Int64[Tensor, "R K"], placed: dict[str, Tensor]
     ) -> Float32[Tensor, "R K N S"]:
         """What is added to the range to each neighbour slot (m), made at ``steps``."""
-        time = (steps * window.layout.arena.dt).to(torch.float32).unsqueeze(-1)
+        time = steps.to(torch.float32).unsqueeze(-1) * window.layout.arena.dt
         skew = (placed["rate"].unsqueeze(1) * time).add_(placed["phase"].unsqueeze(1)).sin_()
         skew = self.skew * skew
         offset = placed["offset"].unsqueeze(1).expand_as(skew)

@@ -23,9 +23,8 @@ from agents.weights import card_of
 from agents.wrappers.correction import Correction
 from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.pettingzoo import parallel_env
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.motion import Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled

@@ -20,13 +20,12 @@ from torch import Tensor
 from torchrl.envs import check_env_specs
 
 from agents.wrappers.correction import with_base
-from coloc_env.envs.actions import ActionMode, Pilot, check, make_mode
+from coloc_env.envs.actions import ActionMode, ModeRunner, checked_tensor, make_mode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.fixes import fixes, relative_fixes
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.pettingzoo import CoLocParallelEnv, env, parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.motion import Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
@@ -376,18 +375,18 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
 def test_a_pilot_gives_every_rows_leaves_when_some_start_anew(mode: str) -> None:
     scenario = indoor()
     world = World(scenario, 3)
-    pilot = Pilot(single(scenario, mode).mode, world)
+    runner = ModeRunner(single(scenario, mode).mode, world)
     world.reset(0)
-    pilot.reset()
+    runner.reset()
     for _ in range(2):
-        world.step(pilot.estimate(torch.full((3, N, 3), 0.7)))
-        before = pilot.observe()
+        world.step(runner.estimate(torch.full((3, N, 3), 0.7)))
+        before = runner.observe()
     rows = torch.tensor([False, True, False])
     world.reset(10, rows)
-    after = pilot.reset(rows)
+    after = runner.reset(rows)
     fresh_world = World(scenario, 3)
     fresh_world.reset(10)
-    fresh = Pilot(single(scenario, mode).mode, fresh_world).reset()
+    fresh = ModeRunner(single(scenario, mode).mode, fresh_world).reset()
     for name, leaf in after.items():
         assert torch.equal(leaf[[0, 2]], before[name][[0, 2]]), name
         torch.testing.assert_close(leaf[1], fresh[name][1], atol=1e-5, rtol=1e-5)
@@ -559,7 +558,7 @@ def test_actions_of_another_number_of_worlds_do_not_fit() -> None:
     scenario = indoor()
     mode = make_mode(scenario, "displacement")
     with refused("indoor-v0: actions of shape (3, 3, 3) do not fit: (2, 3, 3) (worlds, UAVs"):
-        check(scenario, mode, torch.zeros(3, N, 3), 2)
+        checked_tensor(scenario, mode, torch.zeros(3, N, 3), 2)
     made = batched(scenario, "displacement", 2)
     made.reset()
     with refused("actions of shape (2, 2, 3) do not fit: (2, 3, 3)"):

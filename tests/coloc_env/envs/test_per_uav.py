@@ -10,8 +10,7 @@ from torchrl.envs import ExplorationType, RewardSum, TransformedEnv, check_env_s
 
 from agents.policies.learned import actor_for
 from agents.wrappers.correction import with_base
-from coloc_env.envs.per_uav import PerUavEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from training.learning.collectors import fly
 from training.learning.mappo import policy_of
 

@@ -19,9 +19,8 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from tensordict import TensorDictBase
 
 from agents.wrappers.correction import with_base
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.sb3 import CoLocVecEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.scenarios import make_scenario
 
 B, N, H = 3, 2, 5
@@ -125,7 +124,7 @@ def test_every_uav_has_attributes_and_methods_of_its_own() -> None:
     assert env.get_attr("scenario", 0) == [env.scenario]
     env.set_attr("role", "leader", [1, 2])
     assert env.get_attr("role", [1, 2]) == ["leader", "leader"]
-    assert not hasattr(env.slots[0], "role")
+    assert not hasattr(env.sub_envs[0], "role")
     with pytest.raises(AttributeError):
         env.get_attr("role", 0)
     whole = CoLocEnv(env.scenario, B, action="displacement").reset()["state"]
