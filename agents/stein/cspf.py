@@ -225,7 +225,9 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             key = noise.fold(belief.key, belief.step)
             draws = normal(key, "cspf.step", n * poses.dof, self.particles).double()
             draws = draws.unflatten(-1, (n, -1)) * draws.new_tensor(self.std)
-            step = poses.plus(step, draws * moves.steps.to(torch.float32).sqrt()[:, :, None, :, None])
+            step = poses.plus(
+                step, draws * moves.steps.to(torch.float32).sqrt()[:, :, None, :, None]
+            )
         return reckoning.carried(poses, belief.x.transpose(2, 3), step).transpose(2, 3)
 
     def _iterated(

@@ -1,6 +1,8 @@
 """The ``coloc`` command. Heavy imports wait until a command needs them, so that help is instant."""
 
 import os
+import warnings
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +25,9 @@ class _Plain(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                return super().invoke(ctx)
         except BrokenPipeError:
             raise
         except KeyboardInterrupt:
@@ -33,6 +37,10 @@ class _Plain(TyperGroup):
             text = " ".join(str(error).split()) or type(error).__name__
             typer.echo(f"error: {text}", err=True)
             raise typer.Exit(2) from None
+
+
+def _show_warning(message: Warning | str, *rest: Any, **more: Any) -> None:
+    typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 app = typer.Typer(
@@ -52,6 +60,25 @@ app = typer.Typer(
     coloc evaluate indoor-v0 --agents ekf,pf500 --runs 5 --out results/first
     """,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"coloc {version('coloc')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    show_version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
+
 
 ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="See **coloc scenarios**.")]
 Settings = Annotated[

@@ -53,6 +53,6 @@ class Clock:
         skew = self.skew * skew
         offset = placed["offset"].unsqueeze(1).expand_as(skew)
         own = torch.arange(skew.shape[-1], device=steps.device).unsqueeze(-1)
-        first = torch.where(own < window.neighbours, 1.0, -1.0)
+        first = 2.0 * (own < window.neighbours).to(torch.float32) - 1.0
         theirs, ahead = (in_slots(x, window.neighbours) for x in (offset, skew))
         return (offset.unsqueeze(-1) + theirs) + first * (skew.unsqueeze(-1) - ahead)

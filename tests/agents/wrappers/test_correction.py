@@ -12,7 +12,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.registry import LOCALIZERS, make
-from agents.wrappers.correction import Based, Correction, with_base
+from agents.wrappers.correction import Correction, CorrectionMemory, with_base
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.pettingzoo import parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
@@ -22,7 +22,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
-Step = tuple[dict[str, Tensor], Based, Tensor]
+Step = tuple[dict[str, Tensor], CorrectionMemory, Tensor]
 N, WORLDS = 3, 2
 BASES = (
     *("dead_reckoning", "ekf", "ekf:robust=huber+temporal", "ekf_joint", "ekf_trust:weights=none"),
