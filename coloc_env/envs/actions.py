@@ -214,9 +214,8 @@ def checked_tensor(
             f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
             f"(worlds, UAVs, {mode.meaning}) is needed with action={mode.name}"
         )
-    if actions.is_complex() or actions.dtype == torch.bool:
-        kind = str(actions.dtype).removeprefix("torch.")
-        raise ValueError(f"{scenario.name}: actions of type {kind} do not fit; {_needed(mode)}")
+    if actions.is_complex():
+        raise ValueError(f"{scenario.name}: complex actions do not fit; {_needed(mode)}")
     actions = actions.to(torch.float32)
     finite = actions.isfinite()
     if not bool(finite.all()):
@@ -262,7 +261,7 @@ def _array(numbers: Any) -> np.ndarray | None:
         array = np.asarray(numbers)
     except (TypeError, ValueError, RuntimeError):
         return None
-    return array if array.dtype.kind in "fiu" else None
+    return array if array.dtype.kind in "fiub" else None
 
 
 def _needed(mode: ActionMode) -> str:

@@ -119,7 +119,7 @@ class CoLocVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         self.started()
         rows = np.array(actions)
-        if rows.shape != (self.num_envs, self.runner.width) or rows.dtype.kind not in "fiu":
+        if rows.shape != (self.num_envs, self.runner.width) or rows.dtype.kind not in "fiub":
             raise ValueError(
                 f"{self.scenario.name}: real numbers of shape {(self.num_envs, self.runner.width)} "
                 f"are needed, each row {self.mode.meaning}; got {rows.dtype} of shape {rows.shape}"

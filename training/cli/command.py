@@ -151,8 +151,9 @@ def evaluate(
     columns = {key: title for key, title in files.COLUMNS.items() if key not in _TOO_WIDE}
     show(["", *columns.values()], files.rows(found, columns))
     for name, one in found.agents.items():
-        if one.raised:
-            what = f"{name} raised in {one.raised} of {found.runs} runs; first at {one.message}"
+        if one.messages:
+            count = f"{len(one.messages)} of {found.runs} runs"
+            what = f"{name} raised in {count}; first at {one.messages[0]}"
             typer.echo(f"warning: {what}", err=True)
     typer.echo(f"written to {out}")
 
@@ -208,8 +209,8 @@ def render(
 
     built = _scenario(scenario, settings, threads, data)
     from coloc_env.render import frame_to_png, save_animation
+    from training.evaluation.animation import frames
     from training.evaluation.evaluate import make
-    from training.evaluation.rollout import frames
 
     suffix = out.suffix.lower()
     if suffix not in (".gif", ".png"):

@@ -29,7 +29,7 @@ from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import Flights, fly, world_seed
 from training.learning.fleets import SideBySide
 from training.learning.run import (
@@ -249,7 +249,7 @@ def score(
         key = ":".join(f"{k}={v}" for k, v in scene.overrides.items())
         found[key] = {}
         for agent, one in team.items():
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            found[key][agent] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+            result = record(one, scene, torch.arange(runs))
+            found[key][agent] = metrics.rmse(result.error, result.worlds.scored)
         tell("scoring", len(found), len(scenes))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found}

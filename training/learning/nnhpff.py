@@ -22,7 +22,7 @@ from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from coloc_env.sensors import AnchorRanging
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import Flights, fly, world_seed
 from training.learning.fleets import SideBySide
 from training.learning.offline import offline_trainer
@@ -192,10 +192,10 @@ def score(detector: FailureDetector, base: str, runs: int, tell: Progress) -> Ma
             one: Any = make(name, scene, **options)
             if name == "nnhpff":
                 one.learn(detector)
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_mean"] = float(tape.error.mean())
-            if "resets_per_run" in tape.series:
-                each[f"{name}_resets"] = float(tape.series["resets_per_run"].sum(1).mean())
+            result = record(one, scene, torch.arange(runs))
+            each[f"{name}_mean"] = float(result.error.mean())
+            if "resets_per_run" in result.series:
+                each[f"{name}_resets"] = float(result.series["resets_per_run"].sum(1).mean())
         found[f"case {case}"] = each
         tell("scoring", case, 3)
     return {"runs": runs, "seeds": [0, runs - 1], **found}

@@ -23,7 +23,7 @@ from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import Flight, Flights, fly, world_seed
 from training.learning.offline import offline_trainer
 from training.learning.run import (
@@ -212,7 +212,7 @@ def score(localizer: Any, scenario: Scenario, runs: int, tell: Progress) -> Mapp
     """RMSE (m) of ``apf`` and of the trained filter in the worlds of seeds 0 … runs − 1."""
     if runs == 0:
         return {}
-    plain, tapes = make("apf", scenario, seed=localizer.seed), {}
+    plain, records = make("apf", scenario, seed=localizer.seed), {}
     for name, one in (("apf", plain), ("pfnn", localizer)):
         done = 0
 
@@ -221,10 +221,10 @@ def score(localizer: Any, scenario: Scenario, runs: int, tell: Progress) -> Mapp
             done += steps
             tell(f"scoring {name}", done, runs * scenario.horizon)
 
-        tapes[name] = play(one, scenario, torch.arange(runs), tick)
+        records[name] = record(one, scenario, torch.arange(runs), tick)
     per_run = {
-        name: metrics.rmse_per_run(tape.error.numpy(), tape.scored.numpy())
-        for name, tape in tapes.items()
+        name: metrics.rmse_per_run(result.error, result.worlds.scored)
+        for name, result in records.items()
     }
     difference = metrics.paired_difference(per_run["pfnn"], per_run["apf"])
     return {

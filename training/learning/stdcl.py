@@ -22,7 +22,7 @@ from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.augmentation import SwarmAugmentation
 from training.learning.collectors import Flights, fly, world_seed
 from training.learning.fleets import TakingTurns
@@ -223,8 +223,8 @@ def stdcl(
 
 def _scale(base: str, scene: Scenario) -> float:
     """RMSE (m) of the optimizer alone, after it has settled."""
-    tape = play(make(base, scene), scene, _SCALE_SEED + torch.arange(4), lambda steps: None)
-    return metrics.rmse(tape.error[:, 5:].numpy(), tape.scored[:, 5:].numpy())
+    result = record(make(base, scene), scene, _SCALE_SEED + torch.arange(4))
+    return metrics.rmse(result.error[:, 5:], result.worlds.scored[:, 5:])
 
 
 def score(network: StGnn, agent: str, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
@@ -237,8 +237,8 @@ def score(network: StGnn, agent: str, base: str, runs: int, tell: Progress) -> M
         loop.learn(network)
         each = {}
         for name, one in (("trained", loop), ("optimizer", make(base, scene))):
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+            result = record(one, scene, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
         tell("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found

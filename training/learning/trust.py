@@ -21,7 +21,7 @@ from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.collectors import Flights, fly, world_seed
 from training.learning.fleets import TakingTurns
 from training.learning.run import (
@@ -129,7 +129,7 @@ def trust(
     seed: int = 0,
     score_runs: int = 10,
 ) -> Training:
-    """The trust networks of ``ekf_trust`` and ``pfnn_trust``, through a differentiable EKF.
+    """The trust networks of ``ekf_trust`` and ``pf_trust``, through a differentiable EKF.
 
     In each of ``epochs`` epochs ``worlds`` new worlds of every variant of ``scenario`` (clean,
     NLOS, false matches, few landmarks, uniform prior, combinations) are flown by ``ekf_trust``
@@ -183,8 +183,8 @@ def score(network: TrustNetwork, base: str, runs: int, tell: Progress) -> Mappin
         learned.learn(network)
         each = {}
         for name, one in (("ekf_trust", learned), ("ekf_huber", make("ekf:robust=huber", scene))):
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+            result = record(one, scene, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
         tell("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "steps": 300, "rmse": found}

@@ -287,14 +287,18 @@ def test_wrong_use_is_named() -> None:
     with refused("indoor-v0: call reset() first"):
         one.step(np.zeros(3, np.float32))
     one.reset(seed=0)
-    words = "indoor-v0: 3 finite numbers are needed: displacement in m within [-1, 1]"
-    for wrong in (np.zeros(9), np.zeros(2), np.array([0.0, np.nan, 0.0])):
-        with refused(words):
-            one.step(wrong.astype(np.float32))
+    needed = "; (3,) finite numbers are needed with action=displacement: displacement in m within"
+    for wrong, words in (
+        (np.zeros(9), "has shape (9,)"),
+        (np.zeros(2, np.float32), "has shape (2,)"),
+        (np.array([0.0, np.nan, 0.0]), "holds NaN or infinity"),
+        (np.zeros(3, complex), "is not made of real numbers"),
+        (None, "is not made of real numbers"),
+    ):
+        with refused(f"indoor-v0: the action of uav_0 {words}{needed}"):
+            one.step(wrong)
     with refused("unknown agent 'efk'"):
         single_uav(indoor(), base="efk")
-    with refused("base='mappo:weights=none' is not allowed: a filter, such as ekf or pf500"):
-        single_uav(indoor(), base="mappo:weights=none")
     with refused("UAVs that fail do not fit rows of one UAV each"):
         single_uav(indoor(failure_rate=0.5))
     with refused("render_mode='ansi' is not allowed"):
@@ -316,8 +320,8 @@ def test_the_learners_estimate_reaches_the_others() -> None:
     one = single_uav(indoor(), "uav_0", others="ekf", base="none")
     one.reset(seed=0)
     one.step(np.array([1.0, 0.0, 0.0], np.float32))
-    prior = one._seen["uav_0"]["prior"][:3]
-    heard = one._seen["uav_1"]["messages"][:9]
+    prior = one._observations["uav_0"]["prior"][:3]
+    heard = one._observations["uav_1"]["messages"][:9]
     expected = np.concatenate((prior + np.array([1.0, 0.0, 0.0]), np.zeros(6)))
     np.testing.assert_allclose(heard, expected, atol=1e-5)
     assert torch.isfinite(torch.from_numpy(heard)).all()

@@ -265,7 +265,7 @@ def test_without_feedback_the_base_never_knows(base: str) -> None:
 @pytest.mark.parametrize("base", ["ekf:robust=huber+temporal", "apf:particles=60:bounds=40,90"])
 def test_a_reset_of_some_rows_starts_their_base_alone(base: str) -> None:
     scenario = indoor(n_uavs=2, failure_rate=1.0, horizon=9)
-    env, row = with_base(CoLocEnv(scenario, 3), base, 0.5), 1
+    env, row = with_base(CoLocEnv(scenario, 3, seed=0), base, 0.5), 1
     now, kept, ended = env.reset(), [], []
     for _ in range(14):
         now["uav", "action"] = torch.full((3, 2, 3), 0.5)
@@ -339,12 +339,11 @@ class Immovable(Stateless):
 
 @pytest.fixture
 def _more_bases() -> Iterator[None]:
-    before = dict(LOCALIZERS)
-    register("test_stateless")(Stateless)
-    register("test_immovable")(Immovable)
+    LOCALIZERS.register("test_stateless")(Stateless)
+    LOCALIZERS.register("test_immovable")(Immovable)
     yield
-    LOCALIZERS.clear()
-    LOCALIZERS.update(before)
+    LOCALIZERS.remove("test_stateless")
+    LOCALIZERS.remove("test_immovable")
 
 
 @pytest.mark.parametrize(
@@ -356,9 +355,21 @@ def _more_bases() -> Iterator[None]:
         ("ekf", 1.5, "feedback=1.5 is not allowed: a share in [0, 1]"),
         ("ekf", -0.1, "feedback=-0.1 is not allowed: a share in [0, 1]"),
         ("ekf", float("nan"), "feedback=nan is not allowed: a share in [0, 1]"),
-        ("test_stateless", 0.0, "base='test_stateless' is not allowed: a filter, such as ekf"),
-        ("test_immovable", 0.5, "base='test_immovable' is not allowed: a filter, such as ekf"),
-        ("mappo:weights=none", 0.0, "base='mappo:weights=none' is not allowed: a filter, such as"),
+        (
+            "test_stateless",
+            0.5,
+            "base='test_stateless' with feedback=0.5 is not allowed: it cannot",
+        ),
+        (
+            "test_immovable",
+            0.5,
+            "base='test_immovable' with feedback=0.5 is not allowed: it cannot",
+        ),
+        (
+            "mappo:weights=none",
+            1.0,
+            "base='mappo:weights=none' with feedback=1.0 is not allowed: it",
+        ),
     ],
 )
 @pytest.mark.usefixtures("_more_bases")
@@ -372,8 +383,8 @@ def test_wrong_bases_are_named(base: str, feedback: float, words: str) -> None:
 
 @pytest.mark.usefixtures("_more_bases")
 def test_a_base_that_cannot_be_moved_serves_without_feedback() -> None:
-    env = with_base(CoLocEnv(indoor()), "test_immovable")
-    plain = with_base(CoLocEnv(indoor()), "dead_reckoning")
+    env = with_base(CoLocEnv(indoor(), seed=0), "test_immovable")
+    plain = with_base(CoLocEnv(indoor(), seed=0), "dead_reckoning")
     assert torch.equal(env.rollout(2)["state"][:, 0], plain.rollout(2)["state"][:, 0])
 
 

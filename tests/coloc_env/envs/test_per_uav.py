@@ -107,13 +107,13 @@ def reset(env: PerUavEnv, now: TensorDictBase, rows: list[int]) -> TensorDictBas
     return env.reset(now.clone().set("_reset", chosen))
 
 
-def test_the_uavs_of_a_world_start_anew_together() -> None:
+def test_the_uavs_of_a_world_restart_together() -> None:
     env = PerUavEnv(worlds("displacement", 4))
     now = env.reset()
     now["action"] = torch.ones(B * N, 3)
     after = env.step(now)["next"]
     for rows in ([0], [row(1, 0), row(1, 1), row(2, 1)]):
-        words = "the UAVs of a world start anew together, not one by one"
+        words = "the UAVs of a world restart together, not one by one"
         with pytest.raises(ValueError, match=words):
             reset(env, after, rows)
     again = reset(env, after, [row(1, 0), row(1, 1)])

@@ -127,7 +127,7 @@ def test_every_uav_has_attributes_and_methods_of_its_own() -> None:
     assert not hasattr(env.sub_envs[0], "role")
     with pytest.raises(AttributeError):
         env.get_attr("role", 0)
-    whole = CoLocEnv(env.scenario, B, action="displacement").reset()["state"]
+    whole = CoLocEnv(env.scenario, B, seed=0, action="displacement").reset()["state"]
     for i, state in enumerate(env.env_method("state")):
         np.testing.assert_array_equal(state, whole[i // N])
     assert len(env.env_method("state", indices=[2])) == 1
@@ -196,11 +196,20 @@ def test_wrong_use_is_named() -> None:
         with pytest.raises(ValueError, match=re.escape("indoor-v0: call reset() first")):
             use()
     env.reset()
-    needed = "indoor-v0: finite actions of shape (6, 3) are needed, each displacement in m within"
-    for wrong in (np.zeros((6, 9)), np.zeros((3, 3)), np.full((6, 3), np.nan)):
+    needed = "indoor-v0: real numbers of shape (6, 3) are needed, each row displacement in m within"
+    wrong: np.ndarray
+    for wrong in (np.zeros((6, 9)), np.zeros((3, 3)), np.zeros((6, 3), complex), np.array("six")):
         with pytest.raises(ValueError, match=re.escape(needed)) as error:
             env.step(wrong)
-        assert str(error.value).endswith(f"got shape {wrong.shape}")
+        assert str(error.value).endswith(f"got {wrong.dtype} of shape {wrong.shape}")
+    for value in (np.nan, np.inf, 1e200):
+        wrong = np.zeros((6, 3))
+        wrong[4, 1] = value
+        words = (
+            "indoor-v0: the action of uav_0 in world 2 holds NaN or infinity; (3,) finite numbers"
+        )
+        with pytest.raises(ValueError, match=re.escape(words)):
+            env.step(wrong)
 
 
 # ---------------------------------------------------------------- algorithms

@@ -19,7 +19,6 @@ from agents import make
 from agents.policies.actor import Actor
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
 from training.learning import mappo
 from training.learning import run as runs
 from training.learning.collectors import world_seed

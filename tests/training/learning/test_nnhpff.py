@@ -21,7 +21,6 @@ from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario, parse_scenario
-from training.evaluation.rollout import play
 from training.learning import nnhpff as training
 from training.learning import run as runs
 from training.learning.collectors import fly, world_seed

@@ -12,7 +12,6 @@ from agents.particle.corrector import WeightCorrector
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
 from training.learning import pfnn_online
 from training.learning import run as runs
 from training.learning.collectors import fly, world_seed

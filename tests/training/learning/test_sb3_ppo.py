@@ -16,7 +16,6 @@ from torch import Tensor
 from agents import make
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
 from training.learning import run as runs
 from training.learning import sb3_ppo
 from training.learning.collectors import world_seed
