@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
@@ -399,3 +400,74 @@ def test_a_mode_made_elsewhere_does_not_fit() -> None:
         parallel_env(indoor(), action=mode)
     with pytest.raises(ValueError, match="the action mode was made for another scenario"):
         CoLocEnv(indoor(), action=Displacement(indoor().believed))
+
+
+# ---------------------------------------------------------------- bases without a mean state
+
+BARE = [
+    ("swarm-v0", "map", {"n_uavs": 20, "horizon": 8}),
+    ("swarm-v0", "stdcl", {"n_uavs": 20, "horizon": 8}),
+    ("stein2d-v0", "cspf", {"horizon": 8}),
+    ("indoor-v0", "mappo:weights=none", {"n_uavs": 3, "horizon": 8}),
+]
+
+
+@pytest.mark.parametrize(("name", "base", "settings"), BARE)
+def test_any_localizer_with_an_estimate_serves_as_a_base(
+    name: str, base: str, settings: dict[str, Any]
+) -> None:
+    """What is corrected is the localizer's own run, by 2 σ an axis, of which a hundredth of a large
+    arena is the most."""
+    scenario = make_scenario(name, **settings)
+    d, n = scenario.arena.dim, scenario.arena.n_uavs
+    longest = max(b - a for a, b in zip(scenario.arena.low, scenario.arena.high, strict=True))
+    env = with_base(CoLocEnv(scenario, 2, seed=3), base)
+    localizer, world = make(base, scenario), World(scenario, 2)
+    now, seen = env.reset(), world.reset(3)
+    belief, before = localizer.reset(seen), None
+    for _ in range(4):
+        belief, estimate = localizer.step(belief, seen)
+        action = estimate.action()
+        leaves = now["uav", "observation"]
+        assert not {"attitude", "landmark_fixes", "fix_mean"} & set(leaves.keys())
+        torch.testing.assert_close(leaves["base_estimate"], action)
+        torch.testing.assert_close(leaves["base_std"], action[..., 2 * d :].exp())
+        assert leaves["residuals"].shape[-1] == d
+        if before is not None:
+            ahead = before[..., :d] + scenario.arena.dt * before[..., d : 2 * d]
+            # float32 has steps of 0.0005 m at 5 km
+            torch.testing.assert_close(
+                leaves["residuals"], action[..., :d] - ahead, atol=2e-3, rtol=0
+            )
+        before = action
+        push = torch.linspace(-1, 1, 2 * n * d).view(2, n, d)
+        now["uav", "action"] = push
+        now = env.step(now)["next"]
+        most = max(1.0, longest / 100)
+        scale = (2 * action[..., 2 * d :].exp()).clamp(max=most)
+        moved = torch.cat((action[..., :d] + scale * push, action[..., d:]), -1)
+        step = world.step(moved)
+        torch.testing.assert_close(now["uav", "reward"][..., 0], step.reward)
+        seen = world.observation()
+
+
+@pytest.mark.parametrize(("name", "base", "settings"), BARE)
+def test_bases_without_a_state_serve_every_face_and_restart_by_row(
+    name: str, base: str, settings: dict[str, Any]
+) -> None:
+    scenario = make_scenario(name, **settings)
+    single, rows = with_base(parallel_env(scenario), base), with_base(CoLocVecEnv(scenario), base)
+    observations, _ = single.reset(seed=2)
+    assert single.observation_space("uav_0").contains(observations["uav_0"])
+    flat = rows.reset()
+    assert flat.shape == (scenario.arena.n_uavs, 3 * scenario.arena.dim)
+    assert rows.leaves == ("base_std", "residuals", "last_action")
+    batch = with_base(CoLocEnv(scenario, 2, seed=2), base)
+    now = batch.reset()
+    now["uav", "action"] = torch.zeros_like(batch.action_spec.rand()["uav", "action"])
+    after = batch.step(now)["next"]
+    again = batch._reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    kept, stayed = again["uav", "observation", "base_estimate"], after["uav", "observation"]
+    assert torch.equal(kept[1], stayed["base_estimate"][1])
+    fresh = with_base(CoLocEnv(scenario, 1, seed=4), base).reset()
+    torch.testing.assert_close(kept[0], fresh["uav", "observation", "base_estimate"][0])

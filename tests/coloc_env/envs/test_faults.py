@@ -131,7 +131,7 @@ def test_edits_in_place_reach_nothing_on_the_torchrl_face(mode: str) -> None:
             if step == 2:
                 over = torch.tensor([[False], [True], [False]])
             if bool(over.any()):
-                found.append(entries(made.reset(TensorDict({"_reset": over}, [3])), harm))
+                found.append(entries(made._reset(TensorDict({"_reset": over}, [3])), harm))
         return found
 
     clean = rollout(False)
