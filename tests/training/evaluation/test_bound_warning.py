@@ -33,7 +33,7 @@ def scenario() -> Scenario:
 
 
 def test_the_bound_names_the_sensor() -> None:
-    with pytest.raises(NotImplementedError, match="no Fisher information is known for Sonar$"):
+    with pytest.raises(NotImplementedError, match=r"no Fisher information is known for Sonar$"):
         posterior_bound(scenario(), runs=1)
 
 
