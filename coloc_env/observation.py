@@ -118,7 +118,7 @@ def action_bounds(arena: Arena) -> tuple[list[float], list[float]]:
     """Bounds of the flat action: twice the arena's extent, log-std within ±10, and ±50 m/s, or so
     much as crosses the arena's longest side in 50 s.
 
-    They describe where sensible estimates lie (and what samples look like); a finite estimate
+    They describe where sensible estimates lie (and samples are drawn from); a finite estimate
     beyond them is scored, not refused.
     """
     low, high = [], []

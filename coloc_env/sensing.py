@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 
     ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
     on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
-    ``senders[…, s]`` (None: from UAV s); ``heard`` says where one gets through, ``unheard`` which
+    ``senders[…, s]`` (None: from UAV s); ``heard`` is where one gets through, ``unheard`` which
     of all slots' numbers stay 0.
     """
 

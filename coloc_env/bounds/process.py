@@ -204,7 +204,7 @@ def prior_covariance(model: ErrorModel, scenario: Scenario) -> Float64[Tensor, "
 
 
 def true_sensors(scenario: Scenario) -> list[Sensor]:
-    """What measures truly; of a recording, the sensor its tape is described by."""
+    """The true sensor; of a recording, the one that its values are described by."""
     return [s.sensor if isinstance(s, Recorded) else s for s in scenario.sensors]
 
 

@@ -127,7 +127,7 @@ def test_an_integer_seeds_a_batch_row_by_row() -> None:
 
 
 def rows_of(tensordict: TensorDict) -> torch.Tensor:
-    """What tells one world from another."""
+    """What distinguishes one world from another."""
     return tensordict["uav", "observation", "landmark_map"][:, 0]
 
 

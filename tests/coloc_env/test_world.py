@@ -188,9 +188,9 @@ def compare_episodes(
     """Every episode of every row against a world of its own."""
     batch = list(play(scenario, seeds, steps, window, resets))
     for row, seed in enumerate(seeds):
-        begun = {0: seed} | {k: fresh[row] for k, (rows, fresh) in resets.items() if rows[row]}
-        for begin, end in pairwise([*sorted(begun), steps]):
-            alone = play(scenario, [begun[begin]], end - begin)
+        starts = {0: seed} | {k: fresh[row] for k, (rows, fresh) in resets.items() if rows[row]}
+        for begin, end in pairwise([*sorted(starts), steps]):
+            alone = play(scenario, [starts[begin]], end - begin)
             for j, single in enumerate(alone):
                 # What was scored before an episode's first step belongs to the episode before.
                 late = ("reward", "error", "scored", "terminated", "truncated") if not j else ()

@@ -1,4 +1,4 @@
-"""Learned policies as localizers: their checkpoints, what is refused, and that they fly alike."""
+"""Learned policies as localizers: their checkpoints, what is refused, and that they act alike."""
 
 import json
 import re
@@ -227,7 +227,7 @@ def test_an_unknown_name_is_refused() -> None:
     refused("mapo", "unknown checkpoint 'mapo'")
 
 
-# ---------------------------------------------------------------- flying
+# ---------------------------------------------------------------- rollouts
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -307,7 +307,7 @@ def test_a_policy_looks_where_its_base_looks() -> None:
 
 
 def test_a_collector_flies_it() -> None:
-    """Over more than one episode, the network's memory starting anew with each."""
+    """Over more than one episode, the network's memory restarting with each."""
     scenario = indoor()
     mode = modes(scenario)[0]
     agent = PolicyAgent.of(scenario.believed, lively(mode), mode)

@@ -254,11 +254,11 @@ def test_a_seed_is_a_world_and_the_next_follows() -> None:
 def test_an_episode_is_its_seed_and_its_actions() -> None:
     one = single_uav(indoor(), others="pf500:particles=40")
 
-    def fly() -> list[str]:
-        told = [repr(one.reset(seed=3))]
-        return told + [repr(one.step(np.full(3, 0.3, np.float32))) for _ in range(H)]
+    def run() -> list[str]:
+        taken = [repr(one.reset(seed=3))]
+        return taken + [repr(one.step(np.full(3, 0.3, np.float32))) for _ in range(H)]
 
-    assert fly() == fly()
+    assert run() == run()
 
 
 def test_spaces_and_leaves() -> None:

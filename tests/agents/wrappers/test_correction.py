@@ -318,7 +318,7 @@ def test_every_face_takes_a_base() -> None:
 
 
 class Stateless(Localizer[Observation]):
-    """Says the prior, and shows no state."""
+    """Estimates the prior, and has no state to show."""
 
     name = "test_stateless"
 

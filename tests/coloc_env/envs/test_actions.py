@@ -69,7 +69,7 @@ def single(scenario: Scenario, mode: str) -> CoLocParallelEnv:
     return with_base(made) if mode == "correction" else made.with_action(mode)
 
 
-def fly(made: CoLocEnv, actions: Tensor) -> list[TensorDictBase]:
+def simulate(made: CoLocEnv, actions: Tensor) -> list[TensorDictBase]:
     """What is seen before each step [K entries], with the rewards of the action taken in it."""
     now, seen = made.reset(), []
     for action in actions.unbind(2):
@@ -95,7 +95,7 @@ def test_displacements_add_up_from_the_prior(scenario: Scenario) -> None:
     actions = 3 * torch.rand(2, N, 6, dim) - 1.5
     assert (actions.abs() > 1).any()
     estimate = None
-    for step, seen in enumerate(fly(batched(scenario, "displacement", 2), actions)):
+    for step, seen in enumerate(simulate(batched(scenario, "displacement", 2), actions)):
         observation = seen["uav", "observation"]
         if estimate is None:
             estimate = observation["prior"][..., :dim].numpy().astype(np.float64)
@@ -108,9 +108,9 @@ def test_displacements_add_up_from_the_prior(scenario: Scenario) -> None:
         estimate = estimate + actions[:, :, step].numpy().astype(np.float64).clip(-1, 1)
         error = np.linalg.norm(estimate - truth(seen["state"], dim).numpy(), axis=-1)
         np.testing.assert_allclose(seen["next", "uav", "reward"][..., 0], -error, atol=2e-6)
-        told = seen["next", "uav", "observation", "messages"].unflatten(-1, (N, 3 * dim))
-        np.testing.assert_allclose(told[0, 0, 1:, :dim], estimate[0, 1:], atol=1e-5)
-        assert (told[0, 0, 1:, dim:] == 0).all(), "no velocity, a standard deviation of 1 m"
+        received = seen["next", "uav", "observation", "messages"].unflatten(-1, (N, 3 * dim))
+        np.testing.assert_allclose(received[0, 0, 1:, :dim], estimate[0, 1:], atol=1e-5)
+        assert (received[0, 0, 1:, dim:] == 0).all(), "no velocity, a standard deviation of 1 m"
 
 
 def test_the_exact_displacement_earns_exactly_zero() -> None:
@@ -210,11 +210,11 @@ def test_false_masks_leave_nothing() -> None:
 
 
 def test_without_noise_the_leaves_lead_to_the_truth() -> None:
-    """Attitude told and turned exactly, landmarks seen exactly: the fixes' mean is the way."""
+    """Attitude known and turned exactly, landmarks seen exactly: the fixes' mean is the way."""
     scenario = indoor(landmark_std=0.0, gyro_std=0.0, landmark_radius=40.0)
     scenario = replace(scenario, prior=Prior(position_std=1.0, attitude_std=0.0))
     made = batched(scenario, "displacement", 2)
-    for seen in fly(made, 2 * torch.rand(2, N, 6, 3) - 1):
+    for seen in simulate(made, 2 * torch.rand(2, N, 6, 3) - 1):
         observation = seen["uav", "observation"]
         error = seen["state"][:, -3 * N :].unflatten(-1, (N, 3))
         assert (observation["fix_share"] == 1).all()
@@ -231,7 +231,7 @@ def quaternion(wxyz: NDArray) -> Rotation:
 def test_the_attitude_follows_the_gyroscope() -> None:
     scenario = indoor(gyro_std=0.3)
     attitude = None
-    for seen in fly(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 3)):
+    for seen in simulate(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 3)):
         observation = seen["uav", "observation"]
         if attitude is None:
             attitude = quaternion(observation["prior"].numpy()[..., 6:10].astype(np.float64))
@@ -245,17 +245,17 @@ def test_the_attitude_follows_the_gyroscope() -> None:
 def test_the_heading_follows_the_odometry() -> None:
     scenario = plane()
     heading = None
-    for seen in fly(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 2)):
+    for seen in simulate(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 2)):
         observation = seen["uav", "observation"]
         turn = observation["odometry"].numpy()[..., 2].astype(np.float64)
-        told = observation["prior"].numpy()[..., 4].astype(np.float64)
-        heading = told if heading is None else heading + scenario.arena.dt * turn
+        given = observation["prior"].numpy()[..., 4].astype(np.float64)
+        heading = given if heading is None else heading + scenario.arena.dt * turn
         found = observation["attitude"].numpy()[..., 0]
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * heading), atol=1e-5)
 
 
 def test_without_a_gyroscope_the_attitude_stays_the_priors() -> None:
-    for seen in fly(
+    for seen in simulate(
         batched(indoor(imu=False, landmarks=0), "displacement"), torch.zeros(1, N, 4, 3)
     ):
         observation = seen["uav", "observation"]
@@ -352,7 +352,7 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
     scenario = indoor(n_uavs=2, failure_rate=1.0, horizon=9)
     torch.manual_seed(0)
     actions = 2 * torch.rand(3, 2, 25, 3) - 1
-    seen: Any = torch.stack(fly(batched(scenario, mode, 3), actions), 1)
+    seen: Any = torch.stack(simulate(batched(scenario, mode, 3), actions), 1)
     ends = seen["next", "done"][..., 0]
     assert not torch.equal(ends[0], ends[1])
     episodes = 0
@@ -363,7 +363,7 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
                 continue
             episodes += 1
             alone = batched(scenario, mode, seed=row + 3 * e)
-            again: Any = torch.stack(fly(alone, actions[row : row + 1, :, start:stop]), 1)[0]
+            again: Any = torch.stack(simulate(alone, actions[row : row + 1, :, start:stop]), 1)[0]
             part = seen[row, start:stop]
             for key in again.keys(True, True):
                 ours, theirs = part[key].numpy(), again[key].numpy()
@@ -418,11 +418,11 @@ def test_a_whole_episode_is_its_seeds(mode: str) -> None:
     def episode(seed: int) -> list[str]:
         made = single(indoor(), mode)
         rng = np.random.default_rng(1)
-        told = [repr(made.reset(seed=seed))]
+        entries = [repr(made.reset(seed=seed))]
         while made.agents:
             actions = {agent: rng.uniform(-1, 1, 3).astype(np.float32) for agent in made.agents}
-            told.append(repr((made.step(actions), made.state().tolist())))
-        return told
+            entries.append(repr((made.step(actions), made.state().tolist())))
+        return entries
 
     first = episode(5)
     assert len(first) == 7
@@ -636,7 +636,7 @@ def test_memory_and_leaves_need_not_go_together(kind: type[ActionMode]) -> None:
     torch.manual_seed(0)
     actions = 2 * torch.rand(3, 2, 16, 3) - 1
     seen: Any = torch.stack(
-        fly(CoLocEnv(scenario, 3, seed=0, action=kind(scenario.believed)), actions), 1
+        simulate(CoLocEnv(scenario, 3, seed=0, action=kind(scenario.believed)), actions), 1
     )
     ends = seen["next", "done"][..., 0]
     assert not torch.equal(ends[0], ends[1])
@@ -644,7 +644,7 @@ def test_memory_and_leaves_need_not_go_together(kind: type[ActionMode]) -> None:
         stop = int(ends[row].nonzero()[0]) + 1
         for seed, part in ((row, slice(0, stop)), (row + 3, slice(stop, stop + 2))):
             alone = CoLocEnv(scenario, seed=seed, action=kind(scenario.believed))
-            again: Any = torch.stack(fly(alone, actions[row : row + 1, :, part]), 1)[0]
+            again: Any = torch.stack(simulate(alone, actions[row : row + 1, :, part]), 1)[0]
             for key in again.keys(True, True):
                 ours, theirs = seen[row, part][key].numpy(), again[key].numpy()
                 np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=str(key))

@@ -135,7 +135,7 @@ def test_a_seed_is_the_first_worlds() -> None:
 
 @pytest.mark.parametrize("mode", ["displacement", "correction"])
 def test_a_collector_flies_a_recurrent_policy(mode: str) -> None:
-    """Batches that end within an episode: memory goes on there, and starts anew with a world."""
+    """Batches that end within an episode: memory goes on there, and restarts with a world."""
     env = PerUavEnv(worlds(mode, 7, horizon=12))
     torch.manual_seed(0)
     actor = actor_for(env.mode, hidden=8, recurrent=True)

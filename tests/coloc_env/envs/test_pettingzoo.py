@@ -191,11 +191,11 @@ def test_infos_are_flat_numeric_and_always_have_the_same_keys() -> None:
         for agent, info in infos.items():
             errors[agent].append(info["error"])
             assert info["scored"] == 1.0
-    for agent, told in last.items():
+    for agent, info in last.items():
         values = np.array(errors[agent])
-        np.testing.assert_allclose(told["episode_rmse"], np.sqrt((values**2).mean()), rtol=1e-5)
-        np.testing.assert_allclose(told["episode_mean"], values.mean(), rtol=1e-6)
-        assert told["episode_max"] == values.max()
+        np.testing.assert_allclose(info["episode_rmse"], np.sqrt((values**2).mean()), rtol=1e-5)
+        np.testing.assert_allclose(info["episode_mean"], values.mean(), rtol=1e-6)
+        assert info["episode_max"] == values.max()
 
 
 def test_observations_and_arrays_are_nobodys_but_the_agents() -> None:
