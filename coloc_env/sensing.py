@@ -1,7 +1,7 @@
 """Sensing a window: truth, network and every sensor, for some rows over some steps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -14,7 +14,7 @@ from coloc_env.geometry import rotate_by
 from coloc_env.motion import Carry, Kinematics
 from coloc_env.observation import action_width
 from coloc_env.scenario import Prior, Scenario
-from coloc_env.sensors.base import Window
+from coloc_env.sensors.base import Window, in_slots
 
 
 class _Rows:
@@ -169,15 +169,16 @@ def sense(
             for by in delays
         },
     )
+    seen = window if moved.valid is None else _where_known(window, moved.valid)
     leaves: dict[str, Tensor] = {}
     for sensor, own in zip(scenario.sensors, placed, strict=True):
-        leaves |= sensor.sample(window, own)
+        leaves |= sensor.sample(seen if sensor.may_be_blind else window, own)
     heard = network.links(step_keys, neighbours, reach)
     leaves["links"] = heard.to(torch.float32)
     dense = network.dense(arena.n_uavs)
     scored = alive if moved.valid is None else alive & moved.valid
-    if scenario.guides:
-        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.guides)
+    if scenario.anchor_uavs:
+        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.anchor_uavs)
     if not dense:
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
     sensed = Sensed(
@@ -196,6 +197,15 @@ def sense(
         leaves=leaves,
     )
     return sensed, carry, whole.map(lambda x: x[:, -lead:])
+
+
+def _where_known(window: Window, valid: Bool[Tensor, "R K N"]) -> Window:
+    """The window for sensors that are simulated on a recording: where its truth has a hole they
+    would measure what was never there, so there they measure nothing."""
+    other = in_slots(valid, window.neighbours)
+    return replace(
+        window, alive=window.alive & valid, reach=window.reach & valid.unsqueeze(-1) & other
+    )
 
 
 def _join(before: Tensor, now: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ class Reference(Sensor):
     motion from it would know more than its sensors say.
     """
 
+    may_be_blind = False
     informs = False
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:

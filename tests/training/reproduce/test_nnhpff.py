@@ -204,7 +204,7 @@ def quiet(*_: Any) -> None:
 
 
 def test_a_small_report(tmp_path: Path) -> None:
-    where = ["case1", "case1-kidnap_at=18", "trained-q=1-r_believed=0.36"]
+    where = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
     small: dict[str, Any] = {"runs": 2, "seed": 0, "where": where, "steps": 25, "jobs": 1}
     reproduce(tmp_path, "all", missing=True, tell=quiet, note=quiet, **small)
     text = (tmp_path / "report.md").read_text()
