@@ -37,13 +37,8 @@ class Quantity:
 
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
-<<<<<<< HEAD
-        sane = abs(value) <= _MOST or (self.infinite and math.isinf(value))
-        return sane and self.least <= value <= self.most and self.above < value < self.below
-=======
         sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
-        return sane and self.least <= value <= self.most and value > self.above
->>>>>>> e7cf449e1ce19171940fad91b58110f0ccda346b
+        return sane and self.least <= value <= self.most and self.above < value < self.below
 
     def words(self) -> str:
         """The bounds and the unit, as they follow "a number"."""
@@ -83,14 +78,10 @@ AngularRate = Annotated[float, Quantity("rad/s", 0.0)]
 Radians = Annotated[float, Quantity("rad", 0.0)]
 Degrees = Annotated[float, Quantity("°", 0.0)]
 Share = Annotated[float, Quantity("", 0.0, 1.0)]
-<<<<<<< HEAD
 OpenShare = Annotated[float, Quantity("", above=0.0, below=1.0)]
 PositiveShare = Annotated[float, Quantity("", most=1.0, above=0.0)]
-=======
 Ratio = Annotated[float, Quantity("", 0.0)]
->>>>>>> e7cf449e1ce19171940fad91b58110f0ccda346b
 Factor = Annotated[float, Quantity("", above=0.0)]
-NonNegative = Annotated[float, Quantity("", 0.0)]
 Count = Annotated[int, Quantity("", 0)]
 PositiveCount = Annotated[int, Quantity("", 1)]
 

@@ -28,7 +28,7 @@ from agents.stein.update import kernel, stein_step
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
-from coloc_env.options import Factor, NonNegative, OpenShare, PositiveCount, PositiveShare, Share
+from coloc_env.options import Factor, OpenShare, PositiveCount, PositiveShare, Ratio, Share
 from coloc_env.scenario import Believed
 
 Variant = Literal["settled", "neighbourhood", "paper_corrected", "paper"]
@@ -92,7 +92,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         window: PositiveCount = 30,
         gamma: Factor = 1.0,
         eta: Factor = 1.0,
-        repulsion: NonNegative = 0.1,
+        repulsion: Ratio = 0.1,
         pace: Factor = 0.5,
         anneal: PositiveShare = 0.96,
         restart: Share = 0.1,

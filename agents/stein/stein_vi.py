@@ -29,7 +29,7 @@ from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.geometry import Se3, concat, rotate, unrotate
 from coloc_env.observation import Observation
-from coloc_env.options import NonNegative, OpenShare, PositiveCount, PositiveShare
+from coloc_env.options import OpenShare, PositiveCount, PositiveShare, Ratio
 from coloc_env.scenario import Believed, Inertial
 from coloc_env.sensors import Imu, Landmarks
 
@@ -71,7 +71,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
         iterations: PositiveCount = 3,
         anneal: PositiveShare = 0.2,
         pace: PositiveShare = 0.8,
-        repulsion: NonNegative = 1.0,
+        repulsion: Ratio = 1.0,
         outliers: OpenShare = 0.1,
         seed: int = 0,
     ) -> None:

@@ -7,16 +7,12 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from training.evaluation.agreement import team_figures
 
 from agents import make
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
-<<<<<<< HEAD
-=======
 from training.evaluation.team import team_figures
->>>>>>> e7cf449e1ce19171940fad91b58110f0ccda346b
 
 STRANGER = 1
 

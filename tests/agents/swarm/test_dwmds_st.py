@@ -135,13 +135,8 @@ def test_without_links_they_dead_reckon_with_its_covariance(agent: str) -> None:
 
 
 @pytest.mark.parametrize("agent", ["dwmds_st", "map"])
-<<<<<<< HEAD
 def test_without_anchors_the_mean_position_is_dead_reckoned(agent: str) -> None:
-    scenario = make_scenario("swarm-v0", **SMALL | {"anchors": 0.0, "n_uavs": 12})
-=======
-def test_without_fixes_nobody_knows_where_all_are_together(agent: str) -> None:
     scenario = make_scenario("swarm-v0", **SMALL | {"anchor_share": 0.0, "n_uavs": 12})
->>>>>>> e7cf449e1ce19171940fad91b58110f0ccda346b
     localizer, world = make(agent, scenario), World(scenario, 1)
     observation = world.reset(2)
     belief = localizer.reset(observation)

@@ -429,13 +429,8 @@ def test_without_links_they_dead_reckon_with_its_covariance(agent: str) -> None:
 
 
 @pytest.mark.parametrize("agent", METHODS)
-<<<<<<< HEAD
 def test_without_anchors_variances_grow(agent: str) -> None:
-    _, _, covariance = episode(agent, anchors=0.0)
-=======
-def test_a_team_without_anchors_grows_ever_less_sure(agent: str) -> None:
-    _, _, covariance = flown(agent, anchor_share=0.0)
->>>>>>> e7cf449e1ce19171940fad91b58110f0ccda346b
+    _, _, covariance = episode(agent, anchor_share=0.0)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     assert (variance.diff(dim=0)[1:] > 0).all()
     assert (variance[-1] >= 2500.0).all()
