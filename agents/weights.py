@@ -56,10 +56,16 @@ _L = TypeVar("_L", bound=Learned)
 
 @contextmanager
 def drawn_from(seed: int) -> Iterator[None]:
-    """What torch draws inside comes from ``seed`` and leaves its shared generator as it was."""
+    """What torch draws inside comes from ``seed`` and leaves its shared generator as it was; new
+    parameters are float32, whatever torch's default is."""
+    default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        yield
+        torch.set_default_dtype(torch.float32)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(default)
 
 
 def untrained(kind: type[_L], seed: int, **architecture: Any) -> _L:

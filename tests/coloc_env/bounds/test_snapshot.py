@@ -27,7 +27,7 @@ TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.
 
 
 def team(**overrides: Any) -> Scenario:
-    """A swarm, small and, unless told otherwise, fully linked."""
+    """A swarm, small and, unless asked otherwise, fully linked."""
     chosen: dict[str, Any] = {"n_uavs": 8, "anchor_share": 0.5, "comm_radius": None, "horizon": 10}
     return make_scenario("swarm-v0", **(chosen | overrides))
 
@@ -317,11 +317,11 @@ def efficiency(task: Scenario, runs: int, fit: Any) -> float:
     i, j = i[free], j[free]
     bound = snapshot_bound(task, runs, steps=1)
     squared = 0.0
-    for true, told in zip(place, ranges, strict=True):
+    for true, measured in zip(place, ranges, strict=True):
 
-        def residual(x: NDArray[np.float64], true: Any = true, told: Any = told) -> Any:
-            p = np.concatenate((true[:anchors], x.reshape(-1, 3)))
-            return np.linalg.norm(p[i] - p[j], axis=-1) - told[i, j]
+        def residual(x: NDArray[np.float64], true: Any = true, measured: Any = measured) -> Any:
+            p = np.concatenate((true[:guides], x.reshape(-1, 3)))
+            return np.linalg.norm(p[i] - p[j], axis=-1) - measured[i, j]
 
         def jacobian(x: NDArray[np.float64], true: Any = true) -> Any:
             p = np.concatenate((true[:anchors], x.reshape(-1, 3)))
@@ -345,7 +345,7 @@ def test_maximum_likelihood_attains_the_bound_under_gaussian_noise() -> None:
 
 
 def test_maximum_likelihood_comes_near_the_bound_under_nlos() -> None:
-    """It needs many ranges per UAV to tell which are NLOS; from the truth on, as a bound that is
+    """It needs many ranges per UAV to know which are NLOS; from the truth on, as a bound that is
     local wants."""
 
     def fit(residual: Any, jacobian: Any, start: NDArray[np.float64]) -> NDArray[np.float64]:
