@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from coloc_env.datasets.antenna_arrays import relative_poses
-from coloc_env.datasets.files import DataError
 from coloc_env.datasets.grid import Grid, common_grid
-from coloc_env.datasets.recording import Recording
+from coloc_env.datasets.recording import DataError, Recording
 from coloc_env.datasets.replay import lever_arms, recorded_motion, recorded_ranges
 from coloc_env.geometry import Se3
 from coloc_env.sensors import Ranging
