@@ -38,7 +38,8 @@ class Quantity:
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
         sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
-        return sane and self.least <= value <= self.most and self.above < value < self.below
+        below = value < self.below or self.below == math.inf
+        return sane and self.least <= value <= self.most and value > self.above and below
 
     def words(self) -> str:
         """The bounds and the unit, as they follow "a number"."""
