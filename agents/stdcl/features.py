@@ -108,7 +108,7 @@ def graph_inputs(
     gain = torch.cholesky_inverse(root)
     error = (residual / std).clamp(-_CLIP, _CLIP)
     lasting = (means.residual / std).clamp(-_CLIP, _CLIP) * mask
-    uniform = std * mask / (std**2 + variance)
+    uniform = std * mask.to(torch.float32) / (std**2 + variance)
     strengths = (  # ψ(e_ij): linear, clipped, Tukey's, positive, averaged over time
         effective * (residual - shift),
         uniform * error.clamp(-_SOFT, _SOFT),

@@ -220,7 +220,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             key = noise.fold(belief.key, belief.step)
             draws = normal(key, "cspf.step", n * poses.dof, self.particles).double()
             draws = draws.unflatten(-1, (n, -1)) * draws.new_tensor(self.std)
-            d = poses.plus(d, draws * motion.steps.sqrt()[:, :, None, :, None])
+            d = poses.plus(d, draws * motion.steps.to(torch.float32).sqrt()[:, :, None, :, None])
         return odometry.propagate(poses, belief.x.transpose(2, 3), d).transpose(2, 3)
 
     def _iterate(

@@ -181,13 +181,18 @@ class SteinViFilter(Localizer[SteinViBelief]):
             held = torch.full_like(samples[..., 0], self.process.dt)
         held = held * (belief.step > 0).unsqueeze(-1)
         whiter = held.shape[-1] ** 0.5  # the mean over a step is less noisy than a sample
-        return preintegration.preintegrate(
+        window = preintegration.preintegrate(
             samples.unsqueeze(2),
             held.unsqueeze(2),
             belief.state[..., 10:].unsqueeze(2),
             whiter * self.imu.accel_std,
             whiter * self.imu.gyro_std,
         )
+        if "imu_unknown" not in observation:
+            return window
+        unknown = observation["imu_unknown"].double().unbind(-1)
+        added = self.process.strapdown_noise(*unknown)[..., :9, :9]
+        return replace(window, covariance=window.covariance + added.unsqueeze(2))
 
     @staticmethod
     def _moved(

@@ -43,7 +43,10 @@ class RelativeTeam(Localizer[B]):
         turns = self.poses.dof - arena.dim
         self.volume = math.prod(sides) * (8 * math.pi**2 if turns == 3 else 2 * math.pi)
         self.uniform = [s * s / 12 for s in sides] + [math.pi**2 / 3] * turns
-        self.std = [float(s) * arena.dt for s in odometry.std(torch.zeros(self.poses.dof).double())]
+        self.std = [
+            float(s) * arena.dt
+            for s in odometry.std(torch.zeros(self.poses.dof, dtype=torch.float64))
+        ]
 
     @property
     def exchanges(self) -> bool:

@@ -122,4 +122,4 @@ def _averaged(
     """One link for several ranges of this ``weight`` each, and the weight of the link."""
     count = mask.sum(-1)
     mean = torch.where(mask, ranges, 0.0).sum(-1) / count.clamp_min(1)
-    return Links(mean, count > 0), weight * count
+    return Links(mean, count > 0), weight * count.to(torch.float32)

@@ -118,7 +118,7 @@ class EmConfidence(Confidence):
         links = inputs.links
         members = inputs.fixed.any(0).nonzero()[:, 0]
         known = links.mask & inputs.fixed.unsqueeze(-1) & inputs.fixed.unsqueeze(-2)
-        remembered = 0.5 * calibration.MEMORY_STEPS * known.sum((-2, -1))
+        remembered = 0.5 * calibration.MEMORY_STEPS * known.sum((-2, -1)).to(torch.float32)
         others = dense * (1 - remembered / _ENOUGH).clamp_min(0.0)[:, None, None]
         if bool((others > 0).any()):
             members = torch.arange(links.mask.shape[-1], device=members.device)

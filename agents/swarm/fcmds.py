@@ -59,7 +59,9 @@ class FullyConnectedMds(MdsMap):
         )
         y = iterate(update, start.position, belief.step, self.iterations, self.first)
         information = anchor_information(y, distance, weight, fixed, inputs.variance, self.std)
-        stopping = component.sum(-1) / (RELAXATION * self.iterations * self.std**2)
+        stopping = component.sum(-1).to(torch.float32) / (
+            RELAXATION * self.iterations * self.std**2
+        )
         return Solution(y, position_variance(information, stopping, start.variance, fixed))
 
 

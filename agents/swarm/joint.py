@@ -144,7 +144,8 @@ def covariance_of(
 def pin(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
     """An information matrix whose ``fixed`` coordinates are independent and have 1 m⁻²."""
     matrix = matrix.masked_fill(_fixed_pairs(fixed), 0.0)
-    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(fixed, 1.0, _MIN_INFORMATION))
+    least = torch.full_like(fixed, _MIN_INFORMATION, dtype=torch.float32).masked_fill(fixed, 1.0)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(least)
     return matrix
 
 

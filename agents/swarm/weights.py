@@ -38,7 +38,7 @@ def paper_confidence(
     """c_ij = clip(1 − 0.5 s_ij − 0.3 ρ_ij, c_min, 1) (ST-DCL, equation 17): s_ij = 1 where the
     residual is flagged as NLOS, ρ_ij the rate of ``packet_loss``."""
     s = residual > _FLAGGED * (std**2 + variance).sqrt()
-    return (1 - _NLOS * s - _LOSS * packet_loss).clamp(_C_MIN, 1.0)
+    return (1 - _NLOS * s.to(torch.float32) - _LOSS * packet_loss).clamp(_C_MIN, 1.0)
 
 
 def loess(

@@ -26,7 +26,7 @@ from coloc_env import options
 from coloc_env.json_files import read_json
 from coloc_env.options import Quantity
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
-from training.evaluation.results import typed
+from training.evaluation.tables import typed
 from training.learning import state
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger

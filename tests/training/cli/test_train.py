@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from training.cli.command import app
-from training.evaluation.results import typed
+from training.evaluation.tables import typed
 from training.learning.registry import TRAININGS
 
 SMALL = ["--set", "scenario=indoor-v0:n_uavs=2:horizon=20", "--set", "worlds=1"]
