@@ -62,12 +62,14 @@ class NetworkLoop(Localizer[LoopBelief]):
 
     @classmethod
     def ignores(cls, believed: Believed) -> list[str]:
-        """Beside sensors that are not served, the one that drives another motion model than the
+        """Sensors that are not served; if there are none, what drives another motion model than the
         INS's, and ranging with lever arms."""
         ignored, ranging = super().ignores(believed), believed.sensor(Ranging)
+        if ignored:
+            return ignored
         if not isinstance(believed.process, InsDriven):
             drivers = (sensor for sensor in believed.sensors if drives(believed, sensor))
-            ignored += [type(sensor).__name__ for sensor in drivers]
+            ignored = [type(sensor).__name__ for sensor in drivers]
         if ranging is not None and ranging.tags:
             ignored.append(Ranging.__name__)
         return ignored
