@@ -74,7 +74,7 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     chosen = options.checked(name, chosen, known)
     believed: Believed = getattr(scenario, "believed", scenario)  # type: ignore[arg-type]
     _require_served(name, factory, believed)
-    build = getattr(factory, "suited", factory)
+    build = getattr(factory, "for_team", factory)
     try:
         made: Localizer = build(believed, **options.grouped(factory, chosen))
     except ValueError as error:

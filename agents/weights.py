@@ -1,6 +1,6 @@
 """Checkpoints: the weights of learned parts, NAME.safetensors beside NAME.json, its card.
 
-The card says what the weights are for (``kind``, ``features``), the SHA-256 of their file, and how
+The card holds what the weights are for (``kind``, ``features``), the SHA-256 of their file, and how
 they were trained. Nothing is ever executed by loading: safetensors holds numbers only.
 """
 
@@ -56,10 +56,16 @@ _L = TypeVar("_L", bound=Learned)
 
 @contextmanager
 def drawn_from(seed: int) -> Iterator[None]:
-    """What torch draws inside comes from ``seed`` and leaves its shared generator as it was."""
+    """What torch draws inside comes from ``seed`` and leaves its shared generator as it was; new
+    parameters are float32, whatever torch's default is."""
+    default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        yield
+        torch.set_default_dtype(torch.float32)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(default)
 
 
 def untrained(kind: type[_L], seed: int, **architecture: Any) -> _L:
@@ -107,9 +113,9 @@ def card_of(source: str | Path) -> dict[str, Any]:
 def write(weights: Path, module: Learned, trained: Mapping[str, Any]) -> None:
     """Write ``weights`` (NAME.safetensors) and its card NAME.json.
 
-    ``trained``: what the card says of how the weights came to be; a number that is NaN or infinite
+    ``trained``: what the card records of the training; a number that is NaN or infinite
     becomes null. Both files are complete before
-    either gets its name; should only one get it, the hashes differ and loading says so.
+    either gets its name; should only one get it, the hashes differ and loading refuses them.
     """
     data = serialized({name: value.contiguous() for name, value in module.state_dict().items()})
     card = {

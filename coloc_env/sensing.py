@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 
     ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
     on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
-    ``senders[…, s]`` (None: from UAV s); ``heard`` says where one gets through, ``unheard`` which
+    ``senders[…, s]`` (None: from UAV s); ``heard`` is where one gets through, ``unheard`` which
     of all slots' numbers stay 0.
     """
 
@@ -97,12 +97,6 @@ class Sensed(_Rows):
         return [Frame(*views) for views in zip(*cut, strict=True)]
 
     @cached_property
-    def leaf_frames(self) -> list[dict[str, Float32[Tensor, "R N F"]]]:
-        """The leaves of the window's steps one by one."""
-        parts = (leaf.unbind(1) for leaf in self.leaves.values())
-        return [dict(zip(self.leaves, views, strict=True)) for views in zip(*parts, strict=True)]
-
-    @cached_property
     def states(self) -> Float32[Tensor, "R K S"]:
         """The truth, flat: per UAV position, velocity, attitude, alive, scored."""
         flags = torch.stack((self.alive, self.scored), -1)
@@ -115,7 +109,7 @@ class Sensed(_Rows):
         return bool(self.scored.all())
 
     def __getstate__(self) -> dict[str, Any]:
-        """The tensors alone: views are cut anew after a copy."""
+        """The tensors alone: views are cut again after a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
@@ -222,7 +216,7 @@ def _join(before: Tensor, now: Tensor) -> Tensor:
 def draw_prior(
     prior: Prior, keys: Int64[Tensor, "B"], truth: Kinematics, scenario: Scenario
 ) -> Float32[Tensor, "B N F"]:
-    """What each UAV is told of its own start: mean position, velocity, attitude, and their
+    """What each UAV knows of its own start: mean position, velocity, attitude, and their
     standard deviations (position per axis, velocity, attitude)."""
     arena = scenario.arena
     n, dim = truth.position.shape[1:]

@@ -131,7 +131,7 @@ def _made(parent: Path, out: Path) -> Iterator[Path]:
         done = True
     except OSError as error:
         if error.filename is None and error.errno is not None:
-            error.filename = str(out)  # a disk that is full does not say where
+            error.filename = str(out)  # the error of a full disk does not name it
         raise
     finally:
         _remove(partial)

@@ -53,7 +53,7 @@ class PolicyBelief(TensorClass):
 class PolicyAgent(Localizer[PolicyBelief]):
     """A learned policy that takes its best action at every step.
 
-    ``weights``: a checkpoint's name or path, which also says in which action mode it acts and on
+    ``weights``: a checkpoint's name or path, whose card names its action mode and
     which base; ``none``: an untrained network that corrects an ``ekf``.
     """
 

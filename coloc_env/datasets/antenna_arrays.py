@@ -113,7 +113,7 @@ def _starts(
     back = bearing(missing.nanmedian(1).values, other)
     flat = (middle.square() - above.square()).clamp_min(0.01).sqrt()
     heading = (seen - back + math.pi).unsqueeze(-1)
-    heading = heading + torch.arange(_HEADINGS) * (2 * math.pi / _HEADINGS)
+    heading = heading + torch.arange(_HEADINGS, dtype=torch.float32) * (2 * math.pi / _HEADINGS)
     position = torch.stack((flat * seen.cos(), flat * seen.sin(), above), -1)
     zero = torch.zeros_like(heading)
     attitude = torch.stack(((0.5 * heading).cos(), zero, zero, (0.5 * heading).sin()), -1)

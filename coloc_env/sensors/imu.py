@@ -47,8 +47,8 @@ class Imu(Sensor):
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         if not (self.accel_bias or self.gyro_bias):
             return {}
-        scale = torch.tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3, device=keys.device)
         bias = noise.normal(keys, "imu.bias", 6 * layout.arena.n_uavs)
+        scale = bias.new_tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3)
         return {"bias": bias.unflatten(-1, (-1, 6)) * scale}
 
     def turn_rate(self, leaves: Mapping[str, Float32[Tensor, "B N F"]]) -> Float32[Tensor, "B N t"]:

@@ -99,7 +99,8 @@ class Landmarks(Sensor):
         for component in apart[1:]:
             squared = squared.addcmul_(component, component)
         # Straight to float32: a comparison into a mask of bools takes twice as long.
-        reach = torch.where(window.alive, self.radius**2, -1.0).unsqueeze(-1)
+        reach = torch.full_like(window.alive, -1.0, dtype=torch.float32)
+        reach = reach.masked_fill(window.alive, self.radius**2).unsqueeze(-1)
         visible = torch.le(squared, reach, out=squared)
         if self.false_matches:
             draws = noise.uniform(keys, "landmarks.false", 2 * n * self.count)

@@ -19,7 +19,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from agents.policies.team import SingleUavEnv
+from agents.wrappers.single_uav import single_uav
+from coloc_env.envs.gymnasium import SingleUavEnv
 
 Policy = Callable[[np.ndarray], np.ndarray]
 
@@ -45,7 +46,7 @@ def main(
     options["horizon"] = horizon
 
     def make_env(i: int) -> SingleUavEnv:
-        env = SingleUavEnv(**options)
+        env = single_uav(**options)
         env.reset(seed=1_000_000 * (seed + 1) + 10_000 * i)  # the first of this one's own worlds
         return env
 
@@ -67,7 +68,7 @@ def main(
     def policy(observation: np.ndarray) -> np.ndarray:
         return model.predict(train.normalize_obs(observation[None]), deterministic=True)[0][0]
 
-    score = SingleUavEnv(**options)
+    score = single_uav(**options)
     before = mean_error(score, policy, episodes, seed)
     start = time.perf_counter()
     model.learn(steps)

@@ -22,7 +22,9 @@ from coloc_env import CoLocVecEnv
 
 
 def worlds(number: int, horizon: int) -> CoLocVecEnv:
-    return CoLocVecEnv("indoor-v0", number, action="displacement", motion="random", horizon=horizon)
+    return CoLocVecEnv(
+        "indoor-v0", number, seed=0, action="displacement", motion="random", horizon=horizon
+    )
 
 
 def mean_error(model: SAC, env: VecNormalize, seed: int) -> float:

@@ -2,7 +2,7 @@
 
 Read it from top to bottom, and copy it: worlds (``environment``), networks (``policy_of``,
 ``Critic``), and one function, ``_ppo``, that puts collector, loss, buffer and trainer together.
-Every UAV of every world is a row of its own (``coloc_env.envs.per_uav``); all share one policy. The
+Every UAV of every world is a row of its own (``coloc_env.envs.torchrl``); all share one policy. The
 critic sees its own UAV's observation (IPPO) or the privileged state of the team beside it (MAPPO).
 """
 
@@ -25,8 +25,7 @@ from agents.policies.actor import Actor, Body
 from agents.policies.learned import PolicyAgent, actor_for, inputs_of, mode_of
 from agents.weights import drawn_from
 from agents.wrappers.correction import learners_mode
-from coloc_env.envs.per_uav import PerUavEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.options import Factor, PositiveCount, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario

@@ -55,5 +55,6 @@ class ReplayOptions(RecordingOptions):
 def _loaded(
     known: Version, name: str, sequence: str | None, data: str | None, **options: Any
 ) -> Recording:
-    """A recording, kept for the next scenario that replays it until a file of its dataset changes."""
+    """A recording, kept for the next scenario that replays it until a file of its dataset
+    changes."""
     return load(name, sequence, data, **options)

@@ -1,4 +1,4 @@
-"""Learned policies as localizers: their checkpoints, what is refused, and that they fly alike."""
+"""Learned policies as localizers: their checkpoints, what is refused, and that they act alike."""
 
 import json
 import re
@@ -23,9 +23,8 @@ from agents.weights import card_of, write
 from agents.wrappers.correction import Correction
 from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.pettingzoo import parallel_env
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.motion import Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled
@@ -227,7 +226,7 @@ def test_an_unknown_name_is_refused() -> None:
     refused("mapo", "unknown checkpoint 'mapo'")
 
 
-# ---------------------------------------------------------------- flying
+# ---------------------------------------------------------------- rollouts
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
@@ -307,7 +306,7 @@ def test_a_policy_looks_where_its_base_looks() -> None:
 
 
 def test_a_collector_flies_it() -> None:
-    """Over more than one episode, the network's memory starting anew with each."""
+    """Over more than one episode, the network's memory restarting with each."""
     scenario = indoor()
     mode = modes(scenario)[0]
     agent = PolicyAgent.of(scenario.believed, lively(mode), mode)

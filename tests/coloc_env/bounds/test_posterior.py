@@ -179,12 +179,12 @@ def test_bound_holds_while_the_prior_is_broad(anchors: tuple, tight: float) -> N
     task = scenario(AnchorRanging(anchors, RangeNoise(std=std)), dim=2, prior=prior, n=1)
     world = World(task, runs)
     seen = world.reset(0)
-    told = seen["prior"][:, 0, :2].double()
+    prior_mean = seen["prior"][:, 0, :2].double()
     axis = torch.linspace(-8.0, 8.0, 129, dtype=torch.float64)
-    grid = told[:, None] + torch.cartesian_prod(axis, axis)
+    grid = prior_mean[:, None] + torch.cartesian_prod(axis, axis)
     apart = (grid.unsqueeze(2) - torch.tensor(anchors, dtype=torch.float64)).norm(dim=-1)
     likelihood = -0.5 * (((apart - seen["anchor_ranges"].double()) / std) ** 2).sum(-1)
-    weights = (likelihood - 0.5 * ((grid - told[:, None]) / 2.0).square().sum(-1)).softmax(-1)
+    weights = (likelihood - 0.5 * ((grid - prior_mean[:, None]) / 2.0).square().sum(-1)).softmax(-1)
     mean = weights.unsqueeze(1) @ grid
     best = float((weights * (grid - mean).square().sum(-1)).sum(-1).mean().sqrt())
     assert tight * best < posterior_bound(task, runs, steps=1).rmse < best

@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 
 from agents import make
 from agents.policies.adapters import LocalizerPolicy
-from agents.stdcl import stdcl as loops
+from agents.stdcl import loop as loops
 from agents.stdcl.network import StGnn
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
@@ -128,13 +128,16 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
             confidence.requires_grad_()
         belief = belief.replace(base=belief.base.replace(state=state), confidence=confidence)
         with torch.set_grad_enabled(gradients):
-            now = loop.base.prepared(belief.base, observation)
-            found = loop.base.find(belief.base, loops.replace(now, confidence=confidence))
-            weight, off = loop.base.weigh(found.position, now)
-            reach = loop._reach(now, found)
-            scene, _ = loops.look(now, found, weight, off, loop.base.std, belief.memory, reach)
-            owed = loops._owed(belief, now, scene, off)
-        return found.position.detach() + owed, state
+            inputs = loop.base.predict(belief.base, observation)
+            weighted = loops.replace(inputs, confidence=confidence)
+            solution = loop.base.solve(belief.base, weighted)
+            weight, off = loop.base.weights(solution.position, inputs)
+            limit = loop._max_offset(inputs, solution)
+            graph, _ = loops.graph_inputs(
+                inputs, solution, weight, off, loop.base.std, belief.means, limit
+            )
+            carrier = loops._gradient_carrier(belief, inputs, graph, off)
+        return solution.position.detach() + carrier, state
 
     free = slice(recorded.scenario.anchor_uavs, None)
     plain, _ = next_place(0.0, 0.0, False)
