@@ -2,7 +2,7 @@
 line.
 
 Options of a scenario, a localizer or a training are the keyword-only parameters of the function or
-class that makes it; their annotations say what fits. A number says what it measures, and within
+class that makes it; their annotations state what fits: a number what it measures, and within
 what bounds (``Metres``, ``Share``, ``Annotated[float, Quantity("dB", 0)]``). Options that several
 functions have in common are declared once, in a dataclass that extends ``Group``: a parameter of
 that type stands for all its fields, with the defaults that the function gives. Every refusal is one
@@ -38,7 +38,8 @@ class Quantity:
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
         sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
-        return sane and self.least <= value <= self.most and self.above < value < self.below
+        under = value < self.below or self.below == math.inf
+        return sane and self.least <= value <= self.most and value > self.above and under
 
     def words(self) -> str:
         """The bounds and the unit, as they follow "a number"."""

@@ -64,7 +64,7 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     names = tuple(path.name for path in paths)
     if len(set(map(room, names))) != 1 or len(set(names)) != len(names):
         given = ", ".join(names) or "none"
-        raise DataError(f"a EuRoC team is made of different sequences of one room, not {given}")
+        raise DataError(f"a EuRoC team consists of different sequences of one room, not {given}")
     tracks, tables = zip(*map(_sequence, paths), strict=True)
     return Recording(
         name="euroc/" + "+".join(names),

@@ -39,7 +39,7 @@ def load_hanyang(folder: str | os.PathLike[str]) -> Recording:
     """Load one case: ``trajectory.csv`` and a file ``A<number>.csv`` for each anchor.
 
     The recording is in the plane. The tag moves on flat ground (by the truth it leaves its height
-    by less than 0.5 m), and anchors that are 0.5 to 2 m high and within 5 m of each other tell a
+    by less than 0.5 m), and anchors that are 0.5 to 2 m high and within 5 m of each other show a
     tag 10 to 50 m away nothing of its height. So each range r is made horizontal, sqrt(r^2 - h^2)
     with h the height between anchor and tag; the few ranges shorter than h (3 of 9447 in
     NLOS/Trajectory_A) are dropped, and those that are no range (not finite, not positive, beyond

@@ -77,9 +77,9 @@ def load_miluv(
     - calibrated ranges: to anchors +0.02 m, robust deviation 0.09 m, 8 % beyond 0.5 m, all too
       long; between robots -0.02 m, 0.10 m, 4 %; raw ranges are about 0.1 m longer
     - height: robust deviation 0.03 to 0.10 m, as an offset that changes with the place (up to
-      0.2 m for ifo002); on the ground the laser says 0.29 m, its minimum, 0.19 to 0.27 too high
+      0.2 m for ifo002); on the ground the laser reads 0.29 m, its minimum, 0.19 to 0.27 too high
     - IMU: px4's frame is turned against Vicon's body by about 3 degrees (rotation vectors, px4 to
-      Vicon: -1.6, 2.5, 0.8; 1.1, 0.6, 3.1; 1.0, -2.3, -2.2), so that gravity looks like an
+      Vicon: -1.6, 2.5, 0.8; 1.1, 0.6, 3.1; 1.0, -2.3, -2.2), so that gravity appears as an
       accelerometer bias of up to 0.5 m/s^2. Over 1 s its gyro and Vicon differ by 0.011 to
       0.017 rad even when aligned, which is Vicon's error: the gyros of px4 and camera agree to
       0.004, and px4's drifts by no more than 0.1 rad in 60 s

@@ -45,7 +45,7 @@ def load_mrclam(folder: str | os.PathLike[str]) -> Recording:
     robot, robust deviation 0.08 to 0.18 m, 0.9 to 3.1 % beyond 0.5 m; range to robots +0.02 to
     +0.06 m, 0.07 to 0.13 m, at most 0.6 %; bearing 5 to 11 mrad, biased by up to -14 mrad
     (Robot4). Sightings are in time with the truth (within 0.05 s); the commanded odometry runs
-    0.2 to 0.3 s ahead of it, and the robots do 0.90 to 0.95 of what it says.
+    0.2 to 0.3 s ahead of it, and the robots do 0.90 to 0.95 of what is commanded.
 
     Raises:
         DataError: a file is missing or damaged, barcodes are not unique, or one belongs to a robot

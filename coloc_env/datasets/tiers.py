@@ -36,9 +36,9 @@ def load_tiers(file: str | os.PathLike[str], *, held: bool = False) -> Recording
 
     The file has no stamps, and its owners hold each range until the next one comes: 14 % of the
     numbers (13 to 15 % a pair) repeat the one before, up to 6 times. They are dropped unless
-    ``held``; two measurements that agree to the centimetre cannot be told from one that is held.
+    ``held``; two measurements that agree to the centimetre look the same as one that is held.
 
-    Samples are taken to be 0.138 s apart. Their times can be told from ``20221011_processed.csv``,
+    Samples are taken to be 0.138 s apart. Their times follow from ``20221011_processed.csv``,
     which samples the same drive at 7.00 Hz, with stamps (``floor(t) + 10 frac(t)``, since their
     fraction was written as nanoseconds over 1e10) and OptiTrack's distances, but no positions: row
     k + 90 of it and sample 122.7 + 1.034 k show the same six distances to 1 mm. From there to the

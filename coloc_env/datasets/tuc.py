@@ -36,7 +36,7 @@ def load_tuc(stem: str | os.PathLike[str]) -> Recording:
     (so turns on the spot and backward travel are not in it). Streams: anchor_ranges, odometry.
 
     Wheel speeds become v, their mean, and omega, the second less the first over twice ``base``:
-    other than the readme says, the first column is the left wheel's and ``base`` half the distance
+    unlike in the readme, the first column is the left wheel's and ``base`` half the distance
     between the wheels; so the odometry alone follows the truth's 9.2 m within 0.04 m RMS (start
     fitted, and speed and turn scaled by 0.99 and 1.015).
 

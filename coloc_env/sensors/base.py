@@ -39,7 +39,7 @@ class Window:
 
     ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
     step 0). ``rows`` are the rows' noise keys, ``keys`` those of (row, step). Slot ``s`` of UAV
-    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives,
+    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach``: whether its radio signal arrives,
     message loss aside.
     """
 
@@ -121,7 +121,7 @@ class Sensor(ABC):
 
     @abstractmethod
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf says so."""
+        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf is 0 there."""
 
 
 @dataclass(frozen=True, eq=False)

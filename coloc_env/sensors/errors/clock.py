@@ -17,7 +17,7 @@ class Clock:
 
     ``offset``: standard deviation in m of a, what calibration has left of each UAV's antenna delay,
     a constant drawn once. ``skew``: amplitude in m of s, from the frequency error e of its crystal:
-    i begins the exchange, j replies after T, and the range is off by ½ c T (e_i − e_j). It follows
+    i starts the exchange, j replies after T, and the range is off by ½ c T (e_i − e_j). It follows
     the crystal's temperature: a sine whose period is drawn once, between a half and twice
     ``period`` s, so that |s| ≤ ``skew``.
 

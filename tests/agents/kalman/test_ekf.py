@@ -56,7 +56,7 @@ def test_with_fixes_alone_it_is_the_textbook_filter() -> None:
 
 
 def test_the_swarm_is_localized(tools: SimpleNamespace) -> None:
-    """Between dead reckoning and the bound, all but the guides, who know."""
+    """Between dead reckoning and the bound, all but the anchors, who know."""
     scenario = make_scenario("swarm-v0", n_uavs=60, nlos=0.0)
     least = posterior_bound(scenario, 2, steps=40).rmse
     rmse = {}

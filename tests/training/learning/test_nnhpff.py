@@ -102,7 +102,7 @@ def recorded(scenario: Scenario, main: str, worlds: int = 3, steps: int = 40) ->
 def episode() -> SimpleNamespace:
     """Of two robots, one of which fails at step 30, and which lose ranges: four at once, too."""
     torch.set_num_threads(1)
-    overrides: dict[str, Any] = {"case": 3, "n_uavs": 2, "horizon": 40, "dropout": 0.4}
+    overrides: dict[str, Any] = {"case": 3, "n_uavs": 2, "horizon": 40, "uwb_dropout": 0.4}
     scenario = replace(make_scenario("wsn-v0", **overrides), failures=((1, 30),))
     return SimpleNamespace(scenario=scenario, batch=recorded(scenario, "pf:particles=100"))
 
