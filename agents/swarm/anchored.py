@@ -268,4 +268,6 @@ def _uavs(swarm: SwarmBelief, n: int) -> SwarmBelief:
 def _regular(covariance: Float64[Tensor, "B N d d"]) -> Float64[Tensor, "B N d d"]:
     """Covariances of positions (m²), with ``_MIN_VARIANCE`` where they are believed exact."""
     variance = covariance.diagonal(dim1=-2, dim2=-1)
-    return covariance + torch.diag_embed((variance < _MIN_VARIANCE) * _MIN_VARIANCE)
+    return covariance + torch.diag_embed(
+        (variance < _MIN_VARIANCE).to(torch.float32) * _MIN_VARIANCE
+    )

@@ -49,7 +49,7 @@ class Correction(ActionMode):
     to the base (``landmark_fixes`` …, m), ``residuals`` (m: median, Huber mean and scatter of the
     fixes; pull of the ranges, raw and clipped; the innovation, how far the estimate lies from the
     last one moved on at its velocity), ``attitude`` and ``last_action``. A base without a mean
-    state, such as ``map`` or ``cspf``, has no residuals but the innovation, no fixes and no
+    state, such as ``cspf``, has no residuals but the innovation, no fixes and no
     attitude.
     """
 

@@ -402,22 +402,22 @@ def test_a_mode_made_elsewhere_does_not_fit() -> None:
         CoLocEnv(indoor(), action=Displacement(indoor().believed))
 
 
-# ---------------------------------------------------------------- bases without a mean state
+# ---------------------------------------------------------------- bases of every kind
 
-BARE = [
-    ("swarm-v0", "map", {"n_uavs": 20, "horizon": 8}),
-    ("swarm-v0", "stdcl", {"n_uavs": 20, "horizon": 8}),
-    ("stein2d-v0", "cspf", {"horizon": 8}),
-    ("indoor-v0", "mappo:weights=none", {"n_uavs": 3, "horizon": 8}),
+OTHERS = [  # the last: whether ranges' pulls, which need a mean state, are among the residuals
+    ("swarm-v0", "map", {"n_uavs": 20, "horizon": 8}, True),
+    ("swarm-v0", "stdcl", {"n_uavs": 20, "horizon": 8}, True),
+    ("stein2d-v0", "cspf", {"horizon": 8}, False),
+    ("indoor-v0", "mappo:weights=none", {"n_uavs": 3, "horizon": 8}, False),
 ]
 
 
-@pytest.mark.parametrize(("name", "base", "settings"), BARE)
+@pytest.mark.parametrize(("name", "base", "settings", "pulled"), OTHERS)
 def test_any_localizer_with_an_estimate_serves_as_a_base(
-    name: str, base: str, settings: dict[str, Any]
+    name: str, base: str, settings: dict[str, Any], pulled: bool
 ) -> None:
-    """What is corrected is the localizer's own run, by 2 σ an axis, of which a hundredth of a large
-    arena is the most."""
+    """What is corrected is the localizer's own run, by 2 (σ + |pull|) an axis, a hundredth of a
+    large arena at most."""
     scenario = make_scenario(name, **settings)
     d, n = scenario.arena.dim, scenario.arena.n_uavs
     longest = max(b - a for a, b in zip(scenario.arena.low, scenario.arena.high, strict=True))
@@ -432,35 +432,35 @@ def test_any_localizer_with_an_estimate_serves_as_a_base(
         assert not {"attitude", "landmark_fixes", "fix_mean"} & set(leaves.keys())
         torch.testing.assert_close(leaves["base_estimate"], action)
         torch.testing.assert_close(leaves["base_std"], action[..., 2 * d :].exp())
-        assert leaves["residuals"].shape[-1] == d
+        *pulls, innovation = leaves["residuals"].split(d, -1)
+        assert len(pulls) == 2 * pulled
         if before is not None:
             ahead = before[..., :d] + scenario.arena.dt * before[..., d : 2 * d]
             # float32 has steps of 0.0005 m at 5 km
-            torch.testing.assert_close(
-                leaves["residuals"], action[..., :d] - ahead, atol=2e-3, rtol=0
-            )
+            torch.testing.assert_close(innovation, action[..., :d] - ahead, atol=2e-3, rtol=0)
         before = action
         push = torch.linspace(-1, 1, 2 * n * d).view(2, n, d)
         now["uav", "action"] = push
         now = env.step(now)["next"]
         most = max(1.0, longest / 100)
-        scale = (2 * action[..., 2 * d :].exp()).clamp(max=most)
+        off = action[..., 2 * d :].exp() + (pulls[1].abs() if pulled else 0.0)
+        scale = (2 * off).clamp(max=most)
         moved = torch.cat((action[..., :d] + scale * push, action[..., d:]), -1)
         step = world.step(moved)
         torch.testing.assert_close(now["uav", "reward"][..., 0], step.reward)
         seen = world.observation()
 
 
-@pytest.mark.parametrize(("name", "base", "settings"), BARE)
-def test_bases_without_a_state_serve_every_face_and_restart_by_row(
-    name: str, base: str, settings: dict[str, Any]
+@pytest.mark.parametrize(("name", "base", "settings", "pulled"), OTHERS)
+def test_any_base_serves_every_face_and_restarts_by_row(
+    name: str, base: str, settings: dict[str, Any], pulled: bool
 ) -> None:
     scenario = make_scenario(name, **settings)
     single, rows = with_base(parallel_env(scenario), base), with_base(CoLocVecEnv(scenario), base)
     observations, _ = single.reset(seed=2)
     assert single.observation_space("uav_0").contains(observations["uav_0"])
     flat = rows.reset()
-    assert flat.shape == (scenario.arena.n_uavs, 3 * scenario.arena.dim)
+    assert flat.shape == (scenario.arena.n_uavs, (3 + 2 * pulled) * scenario.arena.dim)
     assert rows.leaves == ("base_std", "residuals", "last_action")
     batch = with_base(CoLocEnv(scenario, 2, seed=2), base)
     now = batch.reset()
