@@ -2,7 +2,7 @@
 line.
 
 Options of a scenario, a localizer or a training are the keyword-only parameters of the function or
-class that makes it; their annotations say what fits. A number says what it measures, and within
+class that makes it; their annotations state what fits: a number what it measures, and within
 what bounds (``Metres``, ``Share``, ``Annotated[float, Quantity("dB", 0)]``). Options that several
 functions have in common are declared once, in a dataclass that extends ``Group``: a parameter of
 that type stands for all its fields, with the defaults that the function gives. Every refusal is one
@@ -25,25 +25,33 @@ _MOST = 1e12  # of anything that is measured: beyond, float32 makes no sense of 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a number measures: its ``unit`` and the bounds within which it must lie; ``above``: a
-    bound that it must exceed. Infinity fits only where ``infinite``."""
+    """What a number measures: its ``unit`` and the bounds within which it must lie; ``above`` and
+    ``below``: bounds that it must not reach. Infinity fits only where ``infinite``."""
 
     unit: str = ""
     least: float = -math.inf
     most: float = math.inf
     above: float = -math.inf
+    below: float = math.inf
     infinite: bool = False
 
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
-        sane = abs(value) <= _MOST or (self.infinite and math.isinf(value))
-        return sane and self.least <= value <= self.most and value > self.above
+        sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
+        under = value < self.below or self.below == math.inf
+        return sane and self.least <= value <= self.most and value > self.above and under
 
     def words(self) -> str:
         """The bounds and the unit, as they follow "a number"."""
         bounds = ""
         if self.above > -math.inf:
             bounds = f" > {self.above:g}"
+            if self.below < math.inf:
+                bounds += f" and < {self.below:g}"
+            elif self.most < math.inf:
+                bounds += f" and ≤ {self.most:g}"
+        elif self.least > -math.inf and self.below < math.inf:
+            bounds = f" ≥ {self.least:g} and < {self.below:g}"
         elif self.least > -math.inf and self.most < math.inf:
             bounds = f" from {self.least:g} to {self.most:g}"
         elif self.least > -math.inf:
@@ -71,6 +79,8 @@ AngularRate = Annotated[float, Quantity("rad/s", 0.0)]
 Radians = Annotated[float, Quantity("rad", 0.0)]
 Degrees = Annotated[float, Quantity("°", 0.0)]
 Share = Annotated[float, Quantity("", 0.0, 1.0)]
+OpenShare = Annotated[float, Quantity("", above=0.0, below=1.0)]
+PositiveShare = Annotated[float, Quantity("", most=1.0, above=0.0)]
 Ratio = Annotated[float, Quantity("", 0.0)]
 Factor = Annotated[float, Quantity("", above=0.0)]
 Count = Annotated[int, Quantity("", 0)]

@@ -19,7 +19,7 @@ from agents.models.measurements import Block, Neighbours, heard, make_measuremen
 from agents.models.update import information, iterated_update, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
-from coloc_env.options import PositiveCount, Share
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
 # Weights tried by covariance intersection.
@@ -44,7 +44,7 @@ class CooperativeEkf(GaussianFilter):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: Share = 0.999,
+        gate: OpenShare = 0.999,
         fusion: Literal["naive", "ci"] = "naive",
         iterations: PositiveCount = 2,
         cooperate: bool = True,

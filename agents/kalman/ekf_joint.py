@@ -20,7 +20,7 @@ from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import Prediction, RobustScreen, Trust
 from coloc_env.observation import Observation
-from coloc_env.options import PositiveCount, Share
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
 
@@ -38,7 +38,7 @@ class JointEkf(Localizer[GaussianBelief]):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: Share = 0.999,
+        gate: OpenShare = 0.999,
         iterations: PositiveCount = 2,
         cooperate: bool = True,
     ) -> None:
@@ -100,6 +100,8 @@ class JointEkf(Localizer[GaussianBelief]):
         memory: Float[Tensor, "B N K"],
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B M M"], Float[Tensor, "B N K"]]:
         """Iterated update of the joint state; neighbours are where the joint mean has them."""
+        if not self.models:
+            return x, p, memory
         n, e = x.shape[1], self.process.error_size
         prior = Prediction(x, self._own(p), observation, memory)
         state, updated, delta = x, p, torch.zeros_like(p[..., 0])

@@ -15,7 +15,7 @@ from torch import Tensor
 from agents.kalman.dead_reckoning import DeadReckoning
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import AnchorRanges, Block, make_measurements, nobody
+from agents.models.measurements import AnchorRanges, Block, make_measurements, model_of, nobody
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
@@ -73,8 +73,20 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self.reckoning = DeadReckoning(believed)
         self.process: Process = self.reckoning.process
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
+        if not self.models:
+            raise ValueError("the team measures nothing of its own to estimate from")
+        if not self.models:
+            raise ValueError("needs measurements of landmarks or anchors, and the team has none")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
+
+    @classmethod
+    def ignores(cls, believed: Believed) -> list[str]:
+        """What is measured between UAVs too, where that is all there is to estimate from."""
+        sensors = [s for s in believed.sensors if model_of(type(s)) is not None]
+        alone = sensors and all(sensor.between_uavs for sensor in sensors)
+        between = [type(sensor).__name__ for sensor in sensors] if alone else []
+        return super().ignores(believed) + between
 
     def reset(self, observation: Observation) -> WindowBelief:
         width = self._row(observation).shape[-1]

@@ -29,7 +29,7 @@ from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
-from coloc_env.options import Count, Quantity, Share
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
@@ -63,7 +63,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         tempering: bool = True,
         proposal: Proposal = "prior",
         robust: str = "none",
-        gate: Share = 0.999,
+        gate: OpenShare = 0.999,
         cooperate: bool = True,
         compile: bool = False,
     ) -> None:

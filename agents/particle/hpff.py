@@ -5,7 +5,7 @@ NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filt
 
 from agents.particle.failure import ChiSquare
 from agents.particle.hybrid import HybridFilter
-from coloc_env.options import PositiveCount, Share
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
 
@@ -22,7 +22,7 @@ class Hpff(HybridFilter):
         *,
         main: str = "pf",
         auxiliary: str = "emvf",
-        quantile: Share = 0.98,
+        quantile: OpenShare = 0.98,
         patience: PositiveCount = 1,
     ) -> None:
         sensor = believed.sensor(AnchorRanging)

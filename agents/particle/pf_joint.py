@@ -11,14 +11,14 @@ from torch import Tensor
 from agents.localizer import Estimate
 from agents.particle.belief import normal, own_keys
 from agents.particle.cloud import effective_sample_size, systematic
-from agents.stein import reckoning
-from agents.stein import window as windows
-from agents.stein.likelihood import Scale, compare, factors, outlier_level
+from agents.stein import match_window as windows
+from agents.stein import odometry
+from agents.stein.likelihood import Scale, factors, outlier_level, residuals
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
-from coloc_env.options import Count, Quantity, Share
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 _ROUGH = 0.2  # of the annealed scale: what resampled particles are moved by
@@ -52,18 +52,16 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         believed: Believed,
         *,
         particles: Annotated[int, Quantity("", 2, 100_000)] = 150,
-        anneal: Share = 0.0,
-        outliers: Share = 0.2,
+        anneal: Annotated[float, Quantity("", 0.0, below=1.0)] = 0.0,
+        outliers: OpenShare = 0.2,
         seed: Count = 0,
     ) -> None:
-        if anneal == 1:
-            raise ValueError(f"anneal={anneal} is not allowed: a factor in [0, 1)")
         super().__init__(believed, outliers, anneal or 1.0)
         self.particles, self.annealing, self.seed = particles, anneal > 0, seed
 
     def reset(self, observation: Observation) -> TeamCloud:
         key, origin = own_keys(observation, self.seed), observation["reference"].double()
-        x = self.anywhere(key, origin, 1, self.particles)[:, :, 0]
+        x = self.uniform_poses(key, origin, 1, self.particles)[:, :, 0]
         first = torch.arange(key.shape[1], device=key.device) == 0
         x = torch.where(first[:, None, None], self.poses.identity(x), x)
         return TeamCloud(
@@ -80,10 +78,10 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         poses, n = self.poses, belief.step.shape[1]
         key = noise.fold(belief.key, belief.step)
         dt = (belief.step > 0).double() * self.believed.arena.dt
-        moved = reckoning.increments(poses, observation, dt).unsqueeze(2)
+        moved = odometry.increments(poses, observation, dt).unsqueeze(2)
         spread = (belief.step > 0)[..., None, None] * self._draws(key, "pf_joint.step", self.std)
         moved = poses.plus(moved, spread)
-        x = reckoning.carried(poses, belief.x.transpose(1, 2), moved.transpose(1, 2))
+        x = odometry.propagate(poses, belief.x.transpose(1, 2), moved.transpose(1, 2))
         scale = self._scale(belief.step[:, :1])
         log_weights = belief.log_weights + self._log_likelihood(x, observation, scale)
         log_weights = log_weights.log_softmax(-1)
@@ -112,7 +110,7 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
             step=belief.step + 1,
         )
         origin = observation["reference"].double()
-        return after, self.said(estimate, spread, origin, observation, dt > 0)
+        return after, self.world_estimate(estimate, spread, origin, observation, dt > 0)
 
     def team(self, belief: TeamCloud) -> Float[Tensor, "B H N P"]:
         n = belief.step.shape[1]
@@ -137,13 +135,13 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         """Of this step's matches, a mixture of Gaussian ones and uniform outliers."""
         poses, n = self.poses, x.shape[2]
         everyone = torch.ones_like(observation["links"][..., :n], dtype=torch.bool)
-        new = windows.matches(poses, observation, everyone, True)
+        new = windows.observed_matches(poses, observation, everyone, True)
         new = windows.Matches(*(part[:, :1] for part in vars(new).values()))
-        empty = windows.empty(poses, new.told.shape[:2], new.told.shape[-1], x)
-        window = windows.stored(empty, new)
+        empty = windows.empty(poses, new.mask.shape[:2], new.mask.shape[-1], x)
+        window = windows.insert(empty, new)
         beta = outlier_level(poses, scale, self.outliers, self.volume)
         known = factors(poses, window, scale, n)
-        return compare(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta)[2]
+        return residuals(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta)[2]
 
     def _moments(
         self, x: Float64[Tensor, "B N m P"], log_weights: Float64[Tensor, "B N m"]

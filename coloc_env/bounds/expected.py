@@ -1,5 +1,5 @@
-"""What all of a scenario's sensors tell in one step, at the truth and in expectation over where the
-team may be."""
+"""Information of all of a scenario's sensors in one step, at the truth and in expectation over
+where the team may be."""
 
 import torch
 from jaxtyping import Float64

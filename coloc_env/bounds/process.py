@@ -122,9 +122,14 @@ class InsErrors(ErrorModel):
         if self.ins.bias:
             f = torch.tensor(((1.0, -kept * self.dt), (0.0, kept)), dtype=torch.float64)
             push = torch.tensor((-self.dt, 1.0), dtype=torch.float64)
-            q = fresh * push.outer(push) + white * torch.tensor(((1, 0), (0, 0))).double()
+            q = fresh * push.outer(push) + white * torch.tensor(
+                ((1.0, 0.0), (0.0, 0.0)), dtype=torch.float64
+            )
         else:
-            f, q = torch.ones(1, 1).double(), torch.full((1, 1), white).double()
+            f, q = (
+                torch.ones(1, 1).double(),
+                torch.full((1, 1), white, dtype=torch.float32).double(),
+            )
         axes = torch.eye(self.dim, dtype=torch.float64)
         f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
         shape = (*now.position.shape[:2], *f.shape)
@@ -154,7 +159,10 @@ class ConstantVelocityErrors(ErrorModel):
         shape = (*now.position.shape[:2], 2 * self.dim, 2 * self.dim)
         f, q = discretise(system, drive, self.dt)
         if self.process.held:
-            gain = self.process.accel_std * torch.tensor((0.5 * self.dt**2, self.dt)).double()
+            gain = (
+                self.process.accel_std
+                * torch.tensor((0.5 * self.dt**2, self.dt), dtype=torch.float32).double()
+            )
             q = gain.outer(gain)
         f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
         return f.expand(shape), q.expand(shape)

@@ -6,17 +6,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coloc_env.datasets.files import DataError
 from coloc_env.datasets.grid import (
     Grid,
+    bridged,
     held_intervals,
     imu_on,
     last_on,
     odometry_on,
     slots_on,
     truth_on,
+    unknown_on,
 )
-from coloc_env.datasets.recording import Floats, Recording, Table
+from coloc_env.datasets.recording import DataError, Floats, Recording, Table
 from coloc_env.motion import Arena, RecordedMotion
 from coloc_env.sensors import (
     AnchorRanging,
@@ -53,24 +54,31 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
         grid.dt,
         tuple(low.round(2).tolist()),
         tuple(high.round(2).tolist()),
+        origin=recording.origin,
     )
 
 
-def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) -> RecordedSensor:
-    """Leaf ``imu`` with a calibrated bias (gyro rad/s, accel m/s²; [N, 6]) taken off."""
-    robots = []
+def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) -> RecordedImu:
+    """Leaf ``imu`` with a calibrated bias (gyro rad/s, accel m/s²; [N, 6]) taken off, and where
+    samples are missing leaf ``imu_unknown``."""
+    robots, unknown = [], []
     for table, own in zip(recording.streams["imu"], bias, strict=True):
-        leaf = imu_on(grid, table, own[:3])
+        whole, missing, spread = bridged(table)
+        leaf = imu_on(grid, whole, own[:3])
         leaf[:, :3] -= own[3:]
         robots.append(leaf)
-    return RecordedSensor(sensor, {"imu": _series(robots)})
+        unknown.append(unknown_on(grid, missing, spread))
+    series = {"imu": _series(robots)}
+    if np.any(unknown):
+        series["imu_unknown"] = _series(unknown)
+    return RecordedImu(sensor, series)
 
 
 def recorded_imu_samples(
     recording: Recording, grid: Grid, sensor: Imu, bias: Floats
 ) -> RecordedImu:
     """``recorded_imu``, and beside the mean over each step its samples, less their bias."""
-    held = [held_intervals(grid, table) for table in recording.streams["imu"]]
+    held = [held_intervals(grid, bridged(table)[0]) for table in recording.streams["imu"]]
     width = max(durations.shape[1] for _, durations in held)
     samples, durations = [], []
     for (values, lasting), own in zip(held, bias, strict=True):
@@ -119,7 +127,8 @@ def recorded_bearings(
     maps = {}
     if to_landmarks:
         maps["landmark_map"] = torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)
-    return RecordedSensor(sensor, series, maps), depth
+    dropped = {stream: recording.dropped.get(stream, 0)}
+    return RecordedSensor(sensor, series, maps, dropped), depth
 
 
 def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> RecordedSensor:
@@ -130,7 +139,8 @@ def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> Record
         for t in recording.streams["uav_ranges"]
     ]
     ranges, there = _ranges(recording, grid, "uav_ranges", slots, robots * tags**2, slice(3, 4))
-    return RecordedSensor(sensor, {"ranges": ranges, "range_mask": there})
+    dropped = {"uav_ranges": recording.dropped.get("uav_ranges", 0)}
+    return RecordedSensor(sensor, {"ranges": ranges, "range_mask": there}, dropped=dropped)
 
 
 def recorded_anchor_ranges(
@@ -145,7 +155,9 @@ def recorded_anchor_ranges(
     count = anchors * sensor.n_tags
     ranges, there = _ranges(recording, grid, "anchor_ranges", slots, count, slice(2, 3))
     maps = {"anchor_map": torch.from_numpy(recording.anchors.ravel()).to(torch.float32)}
-    return RecordedSensor(sensor, {"anchor_ranges": ranges, "anchor_range_mask": there}, maps)
+    leaves = {"anchor_ranges": ranges, "anchor_range_mask": there}
+    dropped = {"anchor_ranges": recording.dropped.get("anchor_ranges", 0)}
+    return RecordedSensor(sensor, leaves, maps, dropped)
 
 
 def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> RecordedSensor:
@@ -157,6 +169,7 @@ def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> Recorde
             "height": _series([values for values, _ in tables]),
             "height_mask": _series([there[:, None] for _, there in tables]),
         },
+        dropped={"height": recording.dropped.get("height", 0)},
     )
 
 

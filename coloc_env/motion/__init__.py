@@ -1,7 +1,7 @@
 """Where the truth's motion comes from: scripted, random and recorded motion behind one seam.
 
 All motions are frozen dataclasses. A setting left at ``None`` is fitted to the arena; one that is
-given is kept, or refused with a ``ValueError`` that says what fits. Velocity is the derivative of
+given is kept, or refused with a ``ValueError`` that names what fits. Velocity is the derivative of
 position, in closed form. Positions in m, times in s, angles in rad, z up.
 """
 

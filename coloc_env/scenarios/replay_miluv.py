@@ -70,12 +70,12 @@ def replay_miluv(
     tags = lever_arms(recording)
     error = RangeNoise(std=range_std)
     anchors = AnchorRanging(tuple(map(tuple, recording.anchors.tolist())), error, tags)
-    height = Height(height_std)
-    sensors = [
-        recorded_anchor_ranges(recording, grid, anchors),
-        recorded_height(recording, grid, height),
-    ]
-    believed: list[Sensor] = [anchors, height]
+    sensors = [recorded_anchor_ranges(recording, grid, anchors)]
+    believed: list[Sensor] = [anchors]
+    if "height" in recording.streams:
+        height = Height(height_std)
+        sensors.append(recorded_height(recording, grid, height))
+        believed.append(height)
     if "uav_ranges" in recording.streams:
         uwb = Ranging(error, tags)
         sensors.append(recorded_ranges(recording, grid, uwb))

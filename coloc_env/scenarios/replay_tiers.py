@@ -1,67 +1,15 @@
 """``replay-tiers-v0``: a recording of a team in the plane with ranges between its robots alone."""
 
-from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
-from coloc_env.datasets import Recording, Table, Track
 from coloc_env.datasets.grid import common_grid
-from coloc_env.datasets.recording import Floats
+from coloc_env.datasets.pairs import calibrated_pairs, ordered
 from coloc_env.datasets.replay import arena_of, recorded_motion, recorded_ranges
 from coloc_env.network import Network
 from coloc_env.options import Metres, PositiveCount, Seconds, WhiteAcceleration
 from coloc_env.scenario import ConstantVelocity, InsDriven, PriorOptions, Process, Reward, Scenario
 from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import InsOptions, PositionFix, RangeNoise, Ranging, Sensor
-
-
-def ordered(recording: Recording, order: list[int]) -> Recording:
-    """The recording with its robots in another order."""
-    place = np.argsort(order).astype(np.float64)
-    tables = []
-    for robot in order:
-        table = recording.streams["uav_ranges"][robot]
-        values = table.values.copy()
-        values[:, 1] = place[values[:, 1].astype(np.int64)]
-        tables.append(Table(table.time, values, table.columns))
-    return replace(
-        recording,
-        robots=tuple(recording.robots[robot] for robot in order),
-        truth=tuple(recording.truth[robot] for robot in order),
-        streams={"uav_ranges": tuple(tables)},
-        tags=recording.tags[order],
-    )
-
-
-def true_distances(tracks: tuple[Track, ...], table: Table, robot: int) -> Floats:
-    """Distances [T] (m) by the truth, where and when a robot's table of ranges has one."""
-    own, time = tracks[robot], table.time - tracks[robot].time[0]
-
-    def place(track: Track) -> Floats:
-        xp = track.time - own.time[0]
-        return np.stack([np.interp(time, xp, each) for each in track.position.T], 1)
-
-    others, there = np.stack([place(track) for track in tracks]), np.arange(len(time))
-    return np.linalg.norm(others[table.values[:, 1].astype(np.int64), there] - place(own), axis=1)
-
-
-def calibrated_pairs(recording: Recording, seconds: float) -> Recording:
-    """Every range less its pair's median error in the first ``seconds``, by the truth."""
-    tables = []
-    for robot, table in enumerate(recording.streams["uav_ranges"]):
-        error = table.values[:, 3] - true_distances(recording.truth, table, robot)
-        early = table.time <= recording.truth[robot].time[0] + round(seconds * 1e9)
-        values = table.values.copy()
-        for other in np.unique(values[:, 1]):
-            pair = values[:, 1] == other
-            if not (pair & early).any():
-                raise ValueError(
-                    f"calibration={seconds:g} is not allowed: a pair has no range in so many s"
-                )
-            values[pair, 3] -= np.median(error[pair & early])
-        tables.append(Table(table.time, values, table.columns))
-    return replace(recording, streams={"uav_ranges": tuple(tables)})
 
 
 def replay_tiers(

@@ -39,7 +39,7 @@ class Window:
 
     ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
     step 0). ``rows`` are the rows' noise keys, ``keys`` those of (row, step). Slot ``s`` of UAV
-    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives,
+    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach``: whether its radio signal arrives,
     message loss aside.
     """
 
@@ -76,6 +76,10 @@ class Sensor(ABC):
 
     between_uavs: ClassVar[bool] = False
     """Whether it ties UAVs together (as a range between two does, a range to an anchor not)."""
+
+    may_be_blind: ClassVar[bool] = True
+    """Whether it measures nothing at steps at which the truth is not known (what is recorded, and
+    what drives a motion model, is there at every step)."""
 
     @property
     def delay(self) -> int:
@@ -117,19 +121,24 @@ class Sensor(ABC):
 
     @abstractmethod
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf says so."""
+        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf is 0 there."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedSensor(Sensor):
     """A sensor whose samples come from a recording: step k delivers ``series[leaf][k]``.
 
-    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F].
+    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F]. ``dropped``: by
+    the recording's stream, how many measurements were left out, since no sensor can have given
+    them.
     """
+
+    may_be_blind = False
 
     sensor: Sensor
     series: dict[str, Series]
     maps: dict[str, Tensor] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)

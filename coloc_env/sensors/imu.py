@@ -29,6 +29,8 @@ class Imu(Sensor):
     deviations of a bias drawn once per UAV and world.
     """
 
+    may_be_blind = False
+
     accel_std: float = 0.05
     gyro_std: float = 0.01
     accel_bias: float = 0.0
@@ -45,8 +47,8 @@ class Imu(Sensor):
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         if not (self.accel_bias or self.gyro_bias):
             return {}
-        scale = torch.tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3, device=keys.device)
         bias = noise.normal(keys, "imu.bias", 6 * layout.arena.n_uavs)
+        scale = bias.new_tensor([self.accel_bias] * 3 + [self.gyro_bias] * 3)
         return {"bias": bias.unflatten(-1, (-1, 6)) * scale}
 
     def turn_rate(self, leaves: Mapping[str, Float32[Tensor, "B N F"]]) -> Float32[Tensor, "B N t"]:
@@ -68,14 +70,19 @@ class Imu(Sensor):
 
 @dataclass(frozen=True, eq=False)
 class RecordedImu(RecordedSensor):
-    """A recorded ``Imu`` that also has leaves ``imu_samples`` [S · 6] and ``imu_held`` [S]: each
-    sample in the step that ends now, as it was measured, and for how long it holds (s; 0 where
-    there is none). ``accel_std`` and ``gyro_std`` are those of the mean, as ever."""
+    """A recorded ``Imu`` that may have more leaves beside the mean over each step:
+
+    ``imu_unknown`` [2]: what the mean is off for want of samples, standard deviations an axis of
+    accelerometer (m/s²) and gyro (rad/s), to be added to ``accel_std`` and ``gyro_std``, which are
+    those of the mean as ever. ``imu_samples`` [S · 6] and ``imu_held`` [S]: each sample in the step
+    that ends now, as it was measured, and for how long it holds (s; 0 where there is none).
+    """
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        width = self.series["imu_held"].values.shape[-1]
-        whole = {"imu_samples": Leaf(6 * width), "imu_held": Leaf(width, 0.0)}
-        return super().leaves(layout) | whole
+        more = {name: one.values.shape[-1] for name, one in self.series.items() if name != "imu"}
+        lowest = {"imu_samples": -float("inf")}
+        own = {name: Leaf(width, lowest.get(name, 0.0)) for name, width in more.items()}
+        return super().leaves(layout) | own
 
 
 @dataclass(frozen=True)

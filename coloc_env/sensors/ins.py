@@ -33,6 +33,8 @@ class Ins(Sensor):
     over many draws; the sum of many is as good as Gaussian.
     """
 
+    may_be_blind = False
+
     std: float = 0.5
     bias: float = 0.0
     bias_time: float = 60.0
@@ -71,7 +73,7 @@ class Ins(Sensor):
     def _biases(self, window: Window, placed: dict[str, Tensor]) -> Float32[Tensor, "R K N d"]:
         """The biases at the window's steps."""
         steps = window.steps[..., None, None].to(torch.float32)
-        total = torch.zeros((), device=steps.device)
+        total = steps.new_zeros(())
         waves = (placed[name].unbind(1) for name in ("turn", "phase"))
         for turn, phase in zip(*waves, strict=True):
             angle = (steps * turn.unsqueeze(1)).add_(phase.unsqueeze(1))

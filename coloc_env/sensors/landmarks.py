@@ -99,7 +99,8 @@ class Landmarks(Sensor):
         for component in apart[1:]:
             squared = squared.addcmul_(component, component)
         # Straight to float32: a comparison into a mask of bools takes twice as long.
-        reach = torch.where(window.alive, self.radius**2, -1.0).unsqueeze(-1)
+        reach = torch.full_like(window.alive, -1.0, dtype=torch.float32)
+        reach = reach.masked_fill(window.alive, self.radius**2).unsqueeze(-1)
         visible = torch.le(squared, reach, out=squared)
         if self.false_matches:
             draws = noise.uniform(keys, "landmarks.false", 2 * n * self.count)
@@ -131,7 +132,7 @@ class LandmarkOptions(Group):
     """So many ``landmarks`` stand anywhere in the arena; those within ``landmark_radius`` m are
     seen as position vectors with noise of ``landmark_std`` m per axis. A share ``false_matches`` of
     these belongs to another landmark, a share ``landmark_dropout`` is missing, and in the times
-    ``landmarks_off`` (from, to) none is seen. The team believes the Gaussian part alone.
+    ``range_only`` (from, to) none is seen. The team believes the Gaussian part alone.
     """
 
     title: ClassVar[str] = "landmarks"
@@ -141,12 +142,12 @@ class LandmarkOptions(Group):
     landmark_radius: PositiveMetres = 10.0
     false_matches: Share = 0.0
     landmark_dropout: Share = 0.0
-    landmarks_off: tuple[Seconds, Seconds] | None = None
+    range_only: tuple[Seconds, Seconds] | None = None
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
         """The sensor as it is; nothing without landmarks."""
-        return self._seen(self.false_matches, self.landmark_dropout, self.landmarks_off)
+        return self._seen(self.false_matches, self.landmark_dropout, self.range_only)
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:

@@ -25,6 +25,8 @@ class Odometry(Sensor):
     what it measures.
     """
 
+    may_be_blind = False
+
     forward_std: float = 0.02
     left_std: float = 0.01
     turn_std: float = 0.02

@@ -53,6 +53,6 @@ class AnchorUavOptions(Group):
         return round(self.anchor_share * n_uavs)
 
     def fixes(self, n_uavs: int) -> tuple[PositionFix, ...]:
-        """What tells them where they are; nothing if there are none."""
+        """The sensor by which they know where they are; nothing if there are none."""
         count = self.count(n_uavs)
         return (PositionFix(self.anchor_std, count),) if count else ()

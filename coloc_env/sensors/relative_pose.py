@@ -1,7 +1,7 @@
 """Relative poses between UAVs, as matches of what their cameras see give them: some are wrong."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -93,11 +93,13 @@ class RecordedPoses(Sensor):
     """
 
     between_uavs = True
+    may_be_blind = False
 
     sensor: RelativePose
     pairs: tuple[tuple[int, int], ...]
     poses: Series
     there: Series
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)

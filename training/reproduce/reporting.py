@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from training.evaluation.metrics import Difference
-from training.evaluation.results import plain, table
+from training.evaluation.results import plain
+from training.evaluation.tables import table
 from training.reproduce import verdicts
 from training.reproduce.study import Study
 from training.reproduce.verdicts import Verdict

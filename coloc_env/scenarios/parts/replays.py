@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any, ClassVar
 
 from coloc_env.datasets import Recording, load
+from coloc_env.datasets.folders import Version, dataset_folder, version
 from coloc_env.datasets.grid import Grid
 from coloc_env.options import Group, PositiveSeconds, Seconds
 
@@ -27,14 +28,14 @@ class RecordingOptions(Group):
 
     def load(self, dataset: str, **options: Any) -> Recording:
         """The recording of a data set."""
-        return _loaded(dataset, self.sequence, self.data, **options)
+        known = version(dataset_folder(dataset, self.data))
+        return _loaded(known, dataset, self.sequence, self.data, **options)
 
     def cut(self, grid: Grid) -> Grid:
         """The steps of ``span``, of the steps of a whole recording."""
         if self.span is None:
             return grid
-        first, last = (round(s / grid.dt) for s in self.span)
-        last = min(last, grid.count - 1)
+        first, last = (round(max(-1.0, min(s / grid.dt, grid.count - 1.0))) for s in self.span)
         if not 0 <= first < last:
             raise ValueError(
                 f"span={self.span} is not allowed: (from, to) in s within 0 and "
@@ -51,6 +52,9 @@ class ReplayOptions(RecordingOptions):
 
 
 @lru_cache(maxsize=4)
-def _loaded(name: str, sequence: str | None, data: str | None, **options: Any) -> Recording:
-    """A recording, kept for the next scenario that replays it."""
+def _loaded(
+    known: Version, name: str, sequence: str | None, data: str | None, **options: Any
+) -> Recording:
+    """A recording, kept for the next scenario that replays it until a file of its dataset
+    changes."""
     return load(name, sequence, data, **options)

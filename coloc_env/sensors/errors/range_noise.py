@@ -84,7 +84,8 @@ class RangeNoise:
 
         error = noise.normal(keys, stream, 1)[..., 0]
         if self.tail:
-            error = error * torch.where(chance(self.tail, "tail"), self.tail_std, self.std)
+            wide, narrow = error.new_tensor((self.tail_std, self.std))
+            error = error * torch.where(chance(self.tail, "tail"), wide, narrow)
         else:
             error = error * self.std
         if self.uniform:

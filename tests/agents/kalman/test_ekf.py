@@ -56,7 +56,7 @@ def test_with_fixes_alone_it_is_the_textbook_filter() -> None:
 
 
 def test_the_swarm_is_localized(tools: SimpleNamespace) -> None:
-    """Between dead reckoning and the bound, all but the guides, who know."""
+    """Between dead reckoning and the bound, all but the anchors, who know."""
     scenario = make_scenario("swarm-v0", n_uavs=60, nlos=0.0)
     least = posterior_bound(scenario, 2, steps=40).rmse
     rmse = {}
@@ -159,7 +159,7 @@ def test_robust_weights_cost_little_without_trouble(robust: str, tools: SimpleNa
 
 def test_intersection_stays_honest_without_landmarks(tools: SimpleNamespace) -> None:
     """Ten seconds on ranges alone: what goes round in messages is the same news again and again."""
-    scenario = make_scenario("indoor-v0", landmarks_off=(2.0, 12.0))
+    scenario = make_scenario("indoor-v0", range_only=(2.0, 12.0))
     naive, ci, joint = (
         tools.score(name, scenario, 4, 120) for name in ("ekf", "ekf:fusion=ci", "ekf_joint")
     )

@@ -21,13 +21,12 @@ from agents.particle.failure import (
     evidence,
     network_features,
 )
-from agents.weights import learned, load, untrained
+from agents.weights import learned, load, untrained, write
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import AnchorRanging
 from coloc_env.world import World
-from training.learning.checkpoints import write
 
 some = settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -13,7 +13,7 @@ from agents import make
 from agents.models import preintegration
 from agents.models.measurements import Block
 from agents.models.process import InertialProcess
-from agents.stein.landmarks import sighted
+from agents.stein.landmarks import fit_landmarks
 from agents.stein.stein_vi import SteinViFilter
 from coloc_env.datasets import DataError, load
 from coloc_env.motion import RecordedMotion
@@ -100,14 +100,14 @@ def test_the_mixture_against_autograd_and_its_limits() -> None:
     delta = torch.zeros(3, 6, dtype=torch.float64, requires_grad=True)
     moved = residual - (jacobian @ delta[:, None, :, None])[..., 0]
     block = Block(residual, jacobian, variance.unsqueeze(-1), mask)
-    found = sighted(block, variance, share, volume)
-    shifted = sighted(replace(block, residual=moved), variance, share, volume)
+    found = fit_landmarks(block, variance, share, volume)
+    shifted = fit_landmarks(replace(block, residual=moved), variance, share, volume)
     (gradient,) = torch.autograd.grad(shifted.log_density.sum(), delta)
     torch.testing.assert_close(found.gradient, gradient)
     assert (found.inliers[:, :2] < 1e-12).all()
     beta = share / (1 - share) * (2 * math.pi * 0.04) ** 1.5 / volume
     even = torch.tensor([math.sqrt(-2 * math.log(beta)) * 0.2, 0, 0]).double().expand(3, 8, 3)
-    half = sighted(replace(block, residual=even), variance, share, volume).inliers
+    half = fit_landmarks(replace(block, residual=even), variance, share, volume).inliers
     torch.testing.assert_close(half[:, 2:], torch.full_like(half[:, 2:], 0.5))
 
 
@@ -151,12 +151,12 @@ def test_the_cloud_keeps_apart_and_shrinks_without_repulsion() -> None:
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        ("particles=0", "particles=0 is not allowed: at least 1"),
-        ("iterations=0", "iterations=0 is not allowed: at least 1"),
-        ("outliers=0", r"outliers=0.0 is not allowed: a share in \(0, 1\)"),
-        ("anneal=0", r"anneal=0.0 is not allowed: a factor in \(0, 1\]"),
-        ("pace=2", r"pace=2.0 is not allowed: a factor in \(0, 1\]"),
-        ("repulsion=-1", "repulsion=-1.0 is not allowed: a number ≥ 0"),
+        ("particles=0", "particles='0' is not allowed: a whole number ≥ 1"),
+        ("iterations=0", "iterations='0' is not allowed: a whole number ≥ 1"),
+        ("outliers=0", "outliers='0' is not allowed: a number > 0 and < 1"),
+        ("anneal=0", "anneal='0' is not allowed: a number > 0 and ≤ 1"),
+        ("pace=2", "pace='2' is not allowed: a number > 0 and ≤ 1"),
+        ("repulsion=-1", "repulsion='-1' is not allowed: a number ≥ 0"),
     ],
 )
 def test_refused_options(option: str, words: str) -> None:
@@ -166,7 +166,10 @@ def test_refused_options(option: str, words: str) -> None:
 
 @pytest.mark.parametrize("overrides", [{"landmarks": 0}, {"imu": False}])
 def test_refused_teams(overrides: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"^stein_vi: .*an IMU, landmarks"):
+    believed = make_scenario("indoor-v0", **overrides).believed
+    with pytest.raises(ValueError, match=r"a team with an IMU, landmarks and inertial motion"):
+        SteinViFilter(believed)
+    with pytest.raises(ValueError, match=r"^stein_vi: what the team measures with Ranging"):
         make("stein_vi", make_scenario("indoor-v0", **overrides))
 
 

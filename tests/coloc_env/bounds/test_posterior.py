@@ -179,12 +179,12 @@ def test_bound_holds_while_the_prior_is_broad(anchors: tuple, tight: float) -> N
     task = scenario(AnchorRanging(anchors, RangeNoise(std=std)), dim=2, prior=prior, n=1)
     world = World(task, runs)
     seen = world.reset(0)
-    told = seen["prior"][:, 0, :2].double()
+    prior_mean = seen["prior"][:, 0, :2].double()
     axis = torch.linspace(-8.0, 8.0, 129, dtype=torch.float64)
-    grid = told[:, None] + torch.cartesian_prod(axis, axis)
+    grid = prior_mean[:, None] + torch.cartesian_prod(axis, axis)
     apart = (grid.unsqueeze(2) - torch.tensor(anchors, dtype=torch.float64)).norm(dim=-1)
     likelihood = -0.5 * (((apart - seen["anchor_ranges"].double()) / std) ** 2).sum(-1)
-    weights = (likelihood - 0.5 * ((grid - told[:, None]) / 2.0).square().sum(-1)).softmax(-1)
+    weights = (likelihood - 0.5 * ((grid - prior_mean[:, None]) / 2.0).square().sum(-1)).softmax(-1)
     mean = weights.unsqueeze(1) @ grid
     best = float((weights * (grid - mean).square().sum(-1)).sum(-1).mean().sqrt())
     assert tight * best < posterior_bound(task, runs, steps=1).rmse < best
@@ -712,7 +712,7 @@ def test_runs_are_the_worlds_of_their_seeds(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_masks_are_those_of_the_paired_worlds() -> None:
     """Without landmarks for a second the bound rises, and in each world as its own masks say."""
-    bound = indoor(steps=40, landmarks_off=(1.0, 2.0))
+    bound = indoor(steps=40, range_only=(1.0, 2.0))
     same = indoor(steps=40)
     torch.testing.assert_close(bound.mse[:, :10], same.mse[:, :10])
     assert (bound.mse[:, 19] > 1.2 * same.mse[:, 19]).all()

@@ -30,7 +30,7 @@ LANDMARKS: dict[str, Any] = {
     "landmark_radius": 4.0,
     "false_matches": 0.5,
     "landmark_dropout": 0.5,
-    "landmarks_off": (0.0, 1.0),
+    "range_only": (0.0, 1.0),
 }
 INS: dict[str, Any] = {"ins_std": 1.0, "ins_bias": 1.0, "ins_bias_time": 5.0}
 PRIOR: dict[str, Any] = {"prior": "uniform", "prior_std": 9.0, "max_speed": 2.0}

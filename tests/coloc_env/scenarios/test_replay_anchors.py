@@ -199,7 +199,11 @@ def test_miluv_without_imu_flies() -> None:
 @pytest.mark.parametrize(
     ("name", "overrides", "reason"),
     [
-        ("replay-hanyang-v0", {"range_delay": -0.1}, "range_delay is a time in s ≥ 0"),
+        (
+            "replay-hanyang-v0",
+            {"range_delay": -0.1},
+            "range_delay=-0.1 is not allowed: a number ≥ 0 in s",
+        ),
         ("replay-hanyang-v0", {"dt": 0.2}, "deliver one pair twice within 0.2 s"),
         ("replay-tuc-v0", {"process": "inertial"}, "one of wheeled, constant_velocity"),
         ("replay-tuc-v0", {"prior": "none"}, "one of gaussian, uniform"),

@@ -46,7 +46,9 @@ def test_the_swarm_is_the_papers() -> None:
     assert (arena.low, arena.high) == ((0.0, 0.0, 0.0), (10e3, 10e3, 5e3))
     assert scenario.network.radius == 5e3
     assert scenario.prior.position_std == 50.0
-    error = RangeNoise(10.0, nlos=0.15, nlos_bias=25.0, nlos_kind="constant", tail_std=50.0)
+    error = RangeNoise(
+        10.0, nlos=0.15, nlos_bias=25.0, nlos_kind="constant", tail_std=50.0, impulse_size=500.0
+    )
     own = (Ins(0.5, 0.3, 60.0), PositionFix(0.1, 30))
     assert scenario.sensors == (*own, Ranging(error))
     assert scenario.believed.sensors == (*own, Ranging(RangeNoise(std=10.0)))
@@ -183,17 +185,17 @@ def test_a_weave_is_dense_and_the_other_motions_are_not() -> None:
         assert nearest[motion] > 500.0
 
 
-def test_guides_are_spread_over_the_groups_of_a_weave() -> None:
+def test_anchor_uavs_are_spread_over_the_groups_of_a_weave() -> None:
     position = paths("weave", [4]).position[0]
     first = position[:, :20].mean(0)  # one UAV of each group of ten
     reach = (position.mean(0).unsqueeze(1) - first).norm(dim=-1).argmin(-1)
     assert torch.equal(reach[:30], torch.arange(30) % 20)
 
 
-# ---------------------------------------------------------------- guides
+# ---------------------------------------------------------------- anchors
 
 
-def test_guides_know_where_they_are_and_are_not_scored() -> None:
+def test_anchor_uavs_know_where_they_are_and_are_not_scored() -> None:
     world = World(make_scenario("swarm-v0", n_uavs=10, anchor_share=0.3), 50)
     seen = world.reset(0)
     mask = seen["position_fix_mask"][..., 0]
@@ -209,7 +211,7 @@ def test_guides_know_where_they_are_and_are_not_scored() -> None:
 
 
 @pytest.mark.parametrize("reward", REWARDS)
-def test_guides_earn_nothing_and_say_so(reward: str) -> None:
+def test_anchor_uavs_earn_nothing_and_their_infos_show_it(reward: str) -> None:
     env = parallel_env("swarm-v0", n_uavs=4, anchor_share=0.5, horizon=3, reward=reward)
     _, infos = env.reset(seed=0)
     assert {info["scored"] for info in infos.values()} == {0.0}
@@ -217,8 +219,8 @@ def test_guides_earn_nothing_and_say_so(reward: str) -> None:
     _, rewards, _, _, infos = env.step(still)
     assert [rewards[a] != 0 for a in env.possible_agents] == [False, False, True, True]
     assert [infos[a]["scored"] for a in env.possible_agents] == [0.0, 0.0, 1.0, 1.0]
-    for guide in env.possible_agents[:2]:
-        assert infos[guide]["error"] == infos[guide]["episode_rmse"] == 0.0
+    for anchor in env.possible_agents[:2]:
+        assert infos[anchor]["error"] == infos[anchor]["episode_rmse"] == 0.0
     if reward == "team":
         scored = [infos[a]["error"] for a in env.possible_agents[2:]]
         assert rewards["uav_2"] == rewards["uav_3"] == pytest.approx(-sum(scored) / 2)

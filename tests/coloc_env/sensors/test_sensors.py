@@ -395,7 +395,7 @@ def test_false_matches_show_another_landmark() -> None:
 
 
 def test_landmarks_can_be_off() -> None:
-    world = indoor(landmarks_off=(0.3, 0.6))
+    world = indoor(range_only=(0.3, 0.6))
     visible = []
     for _ in range(9):
         visible.append(bool(world.observation()["landmark_mask"].any()))

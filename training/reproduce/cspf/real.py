@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 
 from training.evaluation.metrics import Floats, rmse_per_run
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.study import WORLD, Variant
 from training.reproduce.verdicts import Claim, Verdict, decide, gain, interval

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from training.evaluation.results import table
+from training.evaluation.tables import table
 from training.reproduce import drawing, reporting, verdicts
 from training.reproduce.cspf import figures, plan, real, tables
 from training.reproduce.cspf.claims import verdicts as judge

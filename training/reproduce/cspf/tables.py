@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cspf import plan
 from training.reproduce.cspf.measures import Runs
 from training.reproduce.verdicts import share

@@ -12,7 +12,8 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import Evaluation, short, table
+from training.evaluation.results import Evaluation
+from training.evaluation.tables import short, table
 from training.reproduce.marl import figures
 from training.reproduce.marl.plan import FILTERS, Goal, Trained, goals, variants
 from training.reproduce.study import WORLD, Study

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.nnhpff.detection import calibration, confusion, curve
 from training.reproduce.nnhpff.flown import Detections, Flown
 from training.reproduce.nnhpff.measures import WITHIN, Runs

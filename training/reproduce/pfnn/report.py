@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from training.evaluation.results import table
+from training.evaluation.tables import table
 from training.reproduce import cost, reporting, verdicts
 from training.reproduce.pfnn import figures, goals, paper, robust_figures, robustness, tables
 from training.reproduce.pfnn.claims import verdicts as judge

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from coloc_env.render.style import FLOOR, INK, MUTED, uav_colours
 from training.evaluation.metrics import mean
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.drawing import save
 from training.reproduce.pfnn.robustness import Cells, compare
 from training.reproduce.study import Variant

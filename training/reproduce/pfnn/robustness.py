@@ -9,7 +9,8 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import Evaluation, short, table
+from training.evaluation.results import Evaluation
+from training.evaluation.tables import short, table
 from training.reproduce.pfnn.plan import runs_in
 from training.reproduce.study import Study, Variant
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.pfnn import paper
 from training.reproduce.pfnn.flown import Flown
 from training.reproduce.pfnn.in_flight import NAME as LEARNING

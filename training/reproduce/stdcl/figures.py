@@ -12,7 +12,7 @@ from coloc_env.render.style import MUTED
 from training.evaluation import metrics
 from training.evaluation.figures import log_axis
 from training.evaluation.metrics import Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cost import Cost
 from training.reproduce.drawing import panels
 from training.reproduce.stdcl import plan

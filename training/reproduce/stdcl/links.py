@@ -180,12 +180,12 @@ class _Weights:
 
     def __init__(self, localizer: Any) -> None:
         base: SwarmFilter = getattr(localizer, "base", localizer)
-        weigh, variance = base.weigh, base.std**2
+        weights, variance = base.weights, base.std**2
         self.last: Floats = np.zeros((0, 0))
 
         def heard(*given: Any) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
-            weight, shift = weigh(*given)
+            weight, shift = weights(*given)
             self.last = variance * weight[0].numpy()
             return weight, shift
 
-        base.weigh = heard  # type: ignore[method-assign, assignment]
+        base.weights = heard  # type: ignore[method-assign, assignment]

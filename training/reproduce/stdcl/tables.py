@@ -7,7 +7,7 @@ import numpy as np
 from coloc_env.bounds import SnapshotBound
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cost import Cost
 from training.reproduce.reporting import DASH, Table, difference, ends
 from training.reproduce.stdcl import plan
