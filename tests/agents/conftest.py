@@ -290,7 +290,7 @@ class Fixes(Measurement):
 
 
 # A linear Gaussian world, where the Kalman filter is the answer. It stands in for a scenario; what
-# is measured in it, such as ``fixes``, filters are told by replacing their ``make_measurements``.
+# is measured in it, such as ``fixes``, filters get by replacing their ``make_measurements``.
 LINEAR = SimpleNamespace(
     believed=Believed(
         arena=Arena(3, 3, 0.5, (-50.0,) * 3, (50.0,) * 3),

@@ -74,11 +74,11 @@ def worlds(
     process = make_process(team)
     std = torch.tensor([team.prior.position_std] * d + [team.prior.velocity_std] * d).double()
     truth = 5 * normal(count, n, 2 * d)
-    told = truth + std * normal(count, n, 2 * d)
+    mean = truth + std * normal(count, n, 2 * d)
     stated = torch.cat((std[: d + 1], torch.tensor([0.05]))).expand(count, n, -1)
     attitude = torch.zeros(count, n, 4)
-    prior = torch.cat((told, attitude, stated), -1).float()
-    truth = truth + (prior[..., : 2 * d] - told)  # so that rounding leaves the error as it was
+    prior = torch.cat((mean, attitude, stated), -1).float()
+    truth = truth + (prior[..., : 2 * d] - mean)  # so that rounding leaves the error as it was
     others = (1 - torch.eye(n)).expand(count, n, n)
     dt = torch.full((count, n), team.arena.dt).double()
     for k in range(steps):

@@ -36,7 +36,7 @@ def unheard(observation: Observation, uav: int, change: Any) -> Observation:
 
 
 def garbled(observation: Observation, uav: int, change: Any) -> Observation:
-    """Other values in all the UAV senses, hears and was told, and other masks."""
+    """Other values in all the UAV senses, receives and is given, and other masks."""
     g = torch.Generator().manual_seed(5)
     leaves = {}
     for name, leaf in observation.leaves.items():
@@ -104,13 +104,13 @@ def test_neighbours_are_used_where_they_are_heard(
         pytest.skip("does not cooperate")
     if case.family in ("wsn", "stein2d"):
         pytest.skip("no range or bearing is measured between UAVs")
-    d, told = case.scenario.arena.dim, []
+    d, garbled_messages = case.scenario.arena.dim, []
     for o in case.run.observations:
         messages = o["messages"].unflatten(-1, (-1, 3 * d)).clone()
         messages[..., 0] += 2.0
         messages[..., 2 * d :] = -1.0
-        told.append(tools.change(o, messages=messages.flatten(-2)))
-    moved = tools.replay(case.localizer, told)
+        garbled_messages.append(tools.change(o, messages=messages.flatten(-2)))
+    moved = tools.replay(case.localizer, garbled_messages)
     assert (moved.position[-1] - case.run.position[-1]).abs().max() > 1e-3
 
 

@@ -1,4 +1,4 @@
-"""The Kalman filters in the room: as good as the bound, as sure as they may be, robust if told."""
+"""The Kalman filters in the room: as good as the bound, as sure as they may be, and robust."""
 
 import math
 from dataclasses import replace
@@ -36,9 +36,9 @@ def test_with_fixes_alone_it_is_the_textbook_filter() -> None:
     localizer, world = make("ekf", scenario), World(scenario)
     seen = world.reset(0)
     belief, filters = localizer.reset(seen), []
-    for told in seen["prior"][0].double().numpy():
+    for prior in seen["prior"][0].double().numpy():
         textbook = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-        textbook.x, textbook.P = told[:3, None], 50.0**2 * np.eye(3)
+        textbook.x, textbook.P = prior[:3, None], 50.0**2 * np.eye(3)
         textbook.F = textbook.B = textbook.H = np.eye(3)
         textbook.Q, textbook.R = (0.5**2 + 2 * 0.3**2) * np.eye(3), 8.0**2 * np.eye(3)
         filters.append(textbook)

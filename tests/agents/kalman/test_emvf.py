@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def kalman(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     return one.x[:, 0], one.P
 
 
-def told(z: Tensor, there: Tensor, dim: int) -> Observation:
+def observed(z: Tensor, there: Tensor, dim: int) -> Observation:
     """What UAVs see whose fixes are z [B, N, d]."""
     prior = torch.zeros(*z.shape[:2], 3 * dim + 2 + (4 if dim == 3 else 1))
     prior[..., -dim - 2 :] = 1.0
@@ -110,9 +111,10 @@ def linear(
         arena=Arena(dim, 3, DT, (-50.0,) * dim, (50.0,) * dim),
         process=ConstantVelocity(q**0.5, held=held),
     )
-    localizer = make("emvf", believed, memory=memory, **options)
+    models = mock.Mock(return_value=[tools.linear.fixes])
+    with mock.patch("agents.kalman.emvf.make_measurements", models):
+        localizer = make("emvf", believed, memory=memory, **options)
     assert isinstance(localizer, MinimumVarianceFir)
-    localizer.models = [tools.linear.fixes]
     localizer.leaves = ["fix", "fix_mask"]
     return localizer
 
@@ -142,9 +144,9 @@ def test_it_is_the_least_squares_solution_and_the_kalman_filter_of_the_window(
     z = (3 * torch.randn(steps, 1, uavs, dim, generator=generator)).float()
     there = torch.rand(steps, 1, uavs, generator=generator) < 0.67
     localizer, (f, g) = linear(tools, memory, dim, q, held), motion(dim, q, held)
-    belief = localizer.reset(told(z[0], there[0], dim))
+    belief = localizer.reset(observed(z[0], there[0], dim))
     for k in range(steps):
-        seen = told(z[k], there[k], dim)
+        seen = observed(z[k], there[k], dim)
         belief, _ = localizer.step(belief, seen)
         state, covariance = (x[0].numpy() for x in localizer.gaussian(belief, seen))
         for i in range(uavs):
@@ -188,7 +190,7 @@ def test_in_a_linear_world_once_is_enough(tools: SimpleNamespace) -> None:
     found = []
     for iterations in (1, 6):
         localizer = linear(tools, 3, 2, 1.0, True, iterations=iterations)
-        seen = [told(*each, 2) for each in zip(z, there, strict=True)]
+        seen = [observed(*each, 2) for each in zip(z, there, strict=True)]
         found.append(tools.replay(localizer, seen).position)
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-10)
 
@@ -407,9 +409,9 @@ def test_watching_is_stepping_without_the_estimate(tools: SimpleNamespace) -> No
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("memory=1", "memory=1, iterations=4 is not allowed: at least 2 steps and 1"),
-        ("memory=0", "memory=0"),
-        ("iterations=0", "memory=3, iterations=0 is not allowed"),
+        ("memory=1", "memory='1' is not allowed: a whole number from 2 to 1000"),
+        ("memory='0'", "memory='0'"),
+        ("iterations=0", "iterations='0' is not allowed: a whole number ≥ 1"),
         ("memory=2.5", "memory='2.5' is not allowed: a whole number"),
         ("window=3", "unknown option 'window'.*memory"),
     ],

@@ -29,7 +29,6 @@ CASES = [
     ("emvf", "wsn"),
     ("hpff", "wsn"),
     ("nnhpff", "anchors"),
-    ("mappo", "default"),
 ]
 
 

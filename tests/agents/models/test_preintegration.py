@@ -179,9 +179,9 @@ def test_correction_for_bias_is_integration_anew_to_first_order(
     shift = torch.tensor([0.05, -0.04, 0.03, 0.01, 0.008, -0.012], dtype=torch.float64)
     left = []
     for size in (1.0, 0.5):
-        anew = integrate(imu, BIAS + size * shift).increments
-        left.append(float(error(found.corrected(BIAS + size * shift), anew).norm(dim=-1).max()))
-        moved = float(error(found.increments, anew).norm(dim=-1).max())
+        again = integrate(imu, BIAS + size * shift).increments
+        left.append(float(error(found.corrected(BIAS + size * shift), again).norm(dim=-1).max()))
+        moved = float(error(found.increments, again).norm(dim=-1).max())
         assert left[-1] < 0.02 * moved
     assert left[1] == pytest.approx(0.25 * left[0], rel=0.05)
 

@@ -244,11 +244,11 @@ def lied_to(localizer: Any, far: float, which: slice, seeds: list[int], tools: A
     """Errors [K, B, N] of a run of 60 steps in which, at the twelfth, landmarks of some numbers are
     seen ``far`` m off; whatever is believed of it, beliefs must stay finite."""
     scenario, lies = make_scenario("indoor-v0"), 12
-    told = list(tools.play(localizer, scenario, seeds, 60).observations)
-    landmarks = told[lies]["landmarks"].unflatten(-1, (-1, 3)).clone()
+    seen = list(tools.play(localizer, scenario, seeds, 60).observations)
+    landmarks = seen[lies]["landmarks"].unflatten(-1, (-1, 3)).clone()
     landmarks[..., which, :] += far
-    told[lies] = tools.change(told[lies], landmarks=landmarks.flatten(-2))
-    run = tools.replay(localizer, told)
+    seen[lies] = tools.change(seen[lies], landmarks=landmarks.flatten(-2))
+    run = tools.replay(localizer, seen)
     for belief, estimate in zip(run.beliefs[1:], run.estimates, strict=True):
         assert belief.particles.isfinite().all()
         assert estimate.position.isfinite().all()

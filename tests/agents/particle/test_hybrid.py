@@ -102,17 +102,17 @@ def test_any_auxiliary_that_knows_a_gaussian_will_do(tools: SimpleNamespace) -> 
     one = make(f"{ALWAYS}:main=pf@particles=50:auxiliary=ekf@iterations=3", scenario)
     run = tools.play(one, scenario, [0, 1], 6)
     expected = tools.replay(make("ekf:iterations=3", scenario), run.observations)
-    told = resets(one, run) > 0
-    assert told[1:].all()
+    restarted = resets(one, run) > 0
+    assert restarted[1:].all()
     position = expected.position.to(run.position)
-    assert torch.equal(run.position[told], position[told])
+    assert torch.equal(run.position[restarted], position[restarted])
 
 
 # ---------------------------------------------------------------- restarting
 
 
 def gaussian(localizer: Any, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """States [2, 2, S] and covariances, correlated, of what a filter may be begun anew from."""
+    """States [2, 2, S] and covariances, correlated, of what a filter may be restarted from."""
     process, g = localizer.process, torch.Generator().manual_seed(seed)
     e = process.error_size
     state = torch.randn(2, 2, process.state_size, generator=g, dtype=torch.float64)
@@ -275,7 +275,7 @@ MIXED = (
 
 @pytest.mark.parametrize("name", MIXED)
 def test_a_row_of_a_batch_is_its_own_run(name: str, tools: SimpleNamespace) -> None:
-    """Also where only other rows are begun anew."""
+    """Also where only other rows are restarted."""
     scenario = wsn(uwb_dropout=0.2)
     localizer = hybrid(name, scenario)
     if name.startswith("nn"):
@@ -337,7 +337,7 @@ def test_it_can_be_corrected_from_outside(main: str, tools: SimpleNamespace) -> 
 def test_the_mahalanobis_distance_is_that_of_the_main_filters_estimate(
     tools: SimpleNamespace,
 ) -> None:
-    """Before it is begun anew."""
+    """Before it is restarted."""
     scenario = wsn(uwb_dropout=0.3)
     one, alone = make(f"{ALWAYS}:main=ekf", scenario), make("ekf", scenario)
     run = tools.play(one, scenario, [0, 1], 5)

@@ -329,10 +329,12 @@ def test_only_what_a_link_carries_is_compared(tools: SimpleNamespace) -> None:
     process, models = make_process(scenario.believed), make_measurements(scenario.believed)
     for linked in (True, False):
         links = seen["links"] * linked
-        told = tools.change(seen, landmarks=landmarks, links=links)
-        x, covariance = process.initial(told["prior"].double())
-        blocks = [m.linearize(process, x, told, received(scenario.believed, told)) for m in models]
-        prediction = Prediction(x, covariance, told, told["prior"][..., :0])
+        changed = tools.change(seen, landmarks=landmarks, links=links)
+        x, covariance = process.initial(changed["prior"].double())
+        blocks = [
+            m.linearize(process, x, changed, received(scenario.believed, changed)) for m in models
+        ]
+        prediction = Prediction(x, covariance, changed, changed["prior"][..., :0])
         weights = CrossValidation(process, models).judge(blocks, prediction)[0]
         assert weights.sum() == weights.numel() - 2 * linked
         assert bool((weights[:, 0, FALSE] == 0).all()) == linked
