@@ -54,7 +54,7 @@ def solved(recording: Recording, steps: int) -> Solved:
         Se3.act(truth.unsqueeze(-2), arms[second]).unsqueeze(-3) - arms[first].unsqueeze(-2), dim=-1
     )
     measured, known = ranges[:, first, second], there[:, first, second]
-    bias, std = torch.empty(len(pairs)).double(), torch.empty(len(pairs)).double()
+    bias, std = torch.empty(2, len(pairs), dtype=torch.float64)
     for pair, (i, j) in enumerate(pairs):
         both = [pair, pairs.index((j, i))]
         error = (measured - clean)[:steps, both][known[:steps, both]]
