@@ -8,6 +8,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
+from agents.models.process import drives
 from agents.stdcl.features import GraphInputs, RunningMeans, graph_inputs, initial_means
 from agents.stdcl.feedback import FEEDBACKS, FeedbackKind
 from agents.stdcl.network import ConvolutionState, Correction, StGnn
@@ -18,6 +19,7 @@ from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import along_links
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
+from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import PositionFix, Ranging
 
 MAX_OFFSET = 3.0  # δ_max in standard deviations (equation 34)
@@ -57,6 +59,20 @@ class NetworkLoop(Localizer[LoopBelief]):
         self.base, self.feedback = base, FEEDBACKS[feedback]()
         self.rate = min(1.0, base.believed.arena.dt / _TRAINING_DT)
         self.network = network.double().requires_grad_(False)
+
+    @classmethod
+    def ignores(cls, believed: Believed) -> list[str]:
+        """Sensors that are not served; if there are none, what drives another motion model than the
+        INS's, and ranging with lever arms."""
+        ignored, ranging = super().ignores(believed), believed.sensor(Ranging)
+        if ignored:
+            return ignored
+        if not isinstance(believed.process, InsDriven):
+            drivers = (sensor for sensor in believed.sensors if drives(believed, sensor))
+            ignored = [type(sensor).__name__ for sensor in drivers]
+        if ranging is not None and ranging.tags:
+            ignored.append(Ranging.__name__)
+        return ignored
 
     def learn(self, network: StGnn) -> None:
         """Correct by this network from now on."""

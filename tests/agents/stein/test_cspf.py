@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from agents import make
+from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
@@ -91,14 +92,14 @@ def test_agents_other_than_0_can_be_renumbered(tools: SimpleNamespace) -> None:
         edges=before.edges[:, order][:, :, order][:, :, :, order],
         started=before.started[:, order][:, :, order],
         window=window.replace(first=renumbered(window.first), second=renumbered(window.second)),
-        tracks=tracks.replace(known=tracks.known[:, :, order], age=tracks.age[:, :, order]),
+        tracks=tracks.replace(received=tracks.received[:, :, order], age=tracks.age[:, :, order]),
     )
-    expected, said = localizer.step(before, observation)
-    found, told = localizer.step(other, Observation(leaves))
+    expected, estimate = localizer.step(before, observation)
+    found, permuted = localizer.step(other, Observation(leaves))
     close = {"rtol": 0, "atol": 1e-8}
     torch.testing.assert_close(found.estimate, expected.estimate[:, order][:, :, order], **close)
-    torch.testing.assert_close(told.position, said.position[:, order], **close)
-    torch.testing.assert_close(told.covariance, said.covariance[:, order], **close)
+    torch.testing.assert_close(permuted.position, estimate.position[:, order], **close)
+    torch.testing.assert_close(permuted.covariance, estimate.covariance[:, order], **close)
 
 
 def test_nan_harms_nobody_else(tools: SimpleNamespace) -> None:
@@ -138,8 +139,8 @@ def test_broadcast_tells_everybody_everything(tools: SimpleNamespace) -> None:
     assert (own.sum(-1) == 20).all()
 
 
-def test_who_is_lost_begins_anew() -> None:
-    """A team told of nothing but wrong matches starts over, time and again."""
+def test_a_holder_without_inliers_restarts() -> None:
+    """A team with wrong matches only restarts, time and again."""
     scenario = make_scenario("stein2d-v0", outliers=1.0)
     localizer, world = make("cspf:particles=10:anneal=0.8:iterations=1", scenario), World(scenario)
     observation = world.reset(0)
@@ -170,8 +171,11 @@ def test_wrong_options_are_named(agent: str, words: str) -> None:
 
 
 def test_other_teams_are_refused() -> None:
-    with pytest.raises(ValueError, match="cspf: a team with relative poses, odometry and a ref"):
-        make("cspf", make_scenario("indoor-v0"))
+    scenario = make_scenario("indoor-v0")
+    with pytest.raises(ValueError, match="cspf: what the team measures with Landmarks, Ranging"):
+        make("cspf", scenario)
+    with pytest.raises(ValueError, match="a team with relative poses, odometry and a reference"):
+        SteinFilter(scenario.believed)
 
 
 def test_figures_of_the_team() -> None:

@@ -166,7 +166,10 @@ def test_refused_options(option: str, words: str) -> None:
 
 @pytest.mark.parametrize("overrides", [{"landmarks": 0}, {"imu": False}])
 def test_refused_teams(overrides: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"^stein_vi: .*an IMU, landmarks"):
+    believed = make_scenario("indoor-v0", **overrides).believed
+    with pytest.raises(ValueError, match=r"a team with an IMU, landmarks and inertial motion"):
+        SteinViFilter(believed)
+    with pytest.raises(ValueError, match=r"^stein_vi: what the team measures with Ranging"):
         make("stein_vi", make_scenario("indoor-v0", **overrides))
 
 

@@ -146,7 +146,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-bound")
     assert done.exit_code == 2
     assert "RMSE" in done.stdout
-    assert done.stderr == "error: [Errno 28] No space left on device\n"
+    assert done.stderr == f"error: [Errno 28] No space left on device: '{tmp_path / 'out'}'\n"
     assert list(tmp_path.iterdir()) == []
 
 
