@@ -75,8 +75,12 @@ class Results:
     def __init__(self, settings: Settings, cells: Iterable[Cell], every: Iterable[Cell]) -> None:
         self.settings, self.store = settings, Store(settings.store)
         self.cells: dict[str, list[Cell]] = {}
-        for cell in cells:
-            self.cells.setdefault(cell.name, []).append(cell)
+        for cell in sorted(cells, key=lambda cell: -cell.runs):
+            there = self.cells.setdefault(cell.name, [])
+            if cell.kind is None or all(
+                (c.kind, c.agents) != (cell.kind, cell.agents) for c in there
+            ):
+                there.append(cell)  # a bound over more runs serves for fewer
         counts: dict[str, set[int]] = {}
         for cell in every:
             if cell.kind is None:
@@ -150,7 +154,7 @@ class Results:
             return Runs(self.evaluation(name, most.runs), agent)
         alone = (agent,) if agent else ()
         piece = self._piece(most, self._able(most) if kind.together else alone)
-        if not piece.agents and most.agents or (most.variant.key, piece.subject) in self.failed:
+        if (not piece.agents and most.agents) or (most.variant.key, piece.subject) in self.failed:
             return None
         found = resolve(kind.load)(most.variant, *piece.load(self.store))
         return found.get(agent) if kind.together else found

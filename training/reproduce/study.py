@@ -25,7 +25,7 @@ from training.reproduce.drawing import Drawing, draw
 from training.reproduce.results import Results
 from training.reproduce.settings import Settings
 from training.reproduce.tables import Table
-from training.reproduce.verdicts import Claim, Goal, Verdict
+from training.reproduce.verdicts import Claim, Goal
 from training.reproduce.work import Cell, Piece, Training, Unit
 
 STUDIES = Registry(
@@ -195,9 +195,13 @@ def _content(study: Study, parts: Sequence[Part], results: Results, folder: Path
     """``results.json``; figures are written to the folder."""
     settings = results.settings
     claims = verdicts.judge((c for part in parts for c in part.claims(settings)), results)
-    goals = verdicts.judge_goals(
-        dict.fromkeys(goal for part in parts for goal in part.goals(settings)), results
-    )
+    wanted = {
+        goal.words: goal
+        for part in parts
+        for goal in part.goals(settings)
+        if all(need[0] in results.cells for need in goal.needs)
+    }
+    goals = verdicts.judge_goals(wanted.values(), results)
     sections = []
     if claims:
         kinds = (verdicts.REPRODUCED, verdicts.NOT, verdicts.CONTRADICTED, verdicts.UNKNOWN)

@@ -25,6 +25,7 @@ REPRODUCED, NOT, CONTRADICTED, UNKNOWN = (
     "not measured",
 )
 MET, MISSED = "met", "missed"
+Found = Difference | str  # a figure of ours, or why there is none
 RULE = """\
 **The rule.** Ours is a mean with its 95 % interval: Student's over runs, of differences paired by
 world where methods are compared; exact binomial for shares of runs; shared among the rivals (after
@@ -39,7 +40,7 @@ A goal is met if the mean is not beyond its limit. Where its words say "interval
 wrong one."""
 
 
-class Found(Protocol):
+class Lookup(Protocol):
     """Where claims look for what they need."""
 
     def get(self, name: str, agent: str = "", kind: Any = None) -> Any: ...
@@ -57,7 +58,7 @@ class Claim:
     limit: float = 0.0
     size: float | None = None
     needs: tuple[Need, ...] = ()
-    figure: Callable[..., Difference | None] = lambda *_: None
+    figure: Callable[..., Found] = lambda *_: "no figure"
 
     @property
     def compares(self) -> bool:
@@ -75,7 +76,7 @@ class Goal:
     limit: float
     above: bool
     needs: tuple[Need, ...]
-    figure: Callable[..., Difference | None]
+    figure: Callable[..., Found]
     by: Literal["mean", "interval", "mean and sign", "not worse"] = "mean"
 
 
@@ -89,26 +90,26 @@ class Verdict:
     reason: str
 
 
-def judge(claims: Iterable[Claim], found: Found) -> list[Verdict]:
+def judge(claims: Iterable[Claim], found: Lookup) -> list[Verdict]:
     """Claims decided; one for which something is missing is not measured."""
     judged = []
     for claim in claims:
         there = [found.get(*need) for need in claim.needs]
         absent = [n for n, one in zip(claim.needs, there, strict=True) if one is None]
-        ours = None if absent else claim.figure(*there)
-        judged.append(decide(claim, ours, _absent(absent)))
+        judged.append(decide(claim, _absent(absent) if absent else claim.figure(*there)))
     return judged
 
 
-def judge_goals(goals: Iterable[Goal], found: Found) -> list[Verdict]:
+def judge_goals(goals: Iterable[Goal], found: Lookup) -> list[Verdict]:
     """Goals decided, once each."""
     judged = []
     for goal in goals:
         there = [found.get(*need) for need in goal.needs]
         absent = [n for n, one in zip(goal.needs, there, strict=True) if one is None]
-        ours = None if absent else goal.figure(*there)
-        if ours is None or np.isnan(ours.mean):
-            judged.append(Verdict(goal, None, UNKNOWN, _absent(absent) or "no figure"))
+        ours = _absent(absent) if absent else goal.figure(*there)
+        if isinstance(ours, str) or np.isnan(ours.mean):
+            why = ours if isinstance(ours, str) else "no figure"
+            judged.append(Verdict(goal, None, UNKNOWN, why))
             continue
         sign = 1.0 if goal.above else -1.0
         near, far = sorted((sign * (ours.low - goal.limit), sign * (ours.high - goal.limit)))
@@ -122,10 +123,12 @@ def judge_goals(goals: Iterable[Goal], found: Found) -> list[Verdict]:
     return judged
 
 
-def decide(claim: Claim, ours: Difference | None, missing: str = "") -> Verdict:
-    """Apply the rule. ``missing``: why there is no figure of ours."""
-    if ours is None or np.isnan([ours.mean, ours.low, ours.high]).any():
-        return Verdict(claim, None, UNKNOWN, missing or "no figure")
+def decide(claim: Claim, ours: Found) -> Verdict:
+    """Apply the rule."""
+    if isinstance(ours, str):
+        return Verdict(claim, None, UNKNOWN, ours)
+    if np.isnan([ours.mean, ours.low, ours.high]).any():
+        return Verdict(claim, None, UNKNOWN, "no figure")
     if claim.side is None:
         inside = ours.low <= claim.limit <= ours.high
         away = "lower" if ours.high < claim.limit else "higher"
@@ -144,8 +147,6 @@ def decide(claim: Claim, ours: Difference | None, missing: str = "") -> Verdict:
 
 def _absent(needs: Sequence[Need]) -> str:
     """What is missing, by name."""
-    if not needs:
-        return ""
     what = dict.fromkeys(need[1] or need[2].label for need in needs if need[1] or len(need) > 2)
     places = list(dict.fromkeys(need[0] for need in needs))
     more = " and others" if len(places) > 1 else ""
@@ -231,11 +232,10 @@ def claims_table(judged: Sequence[Verdict]) -> Table:
     """Claims, the paper's figures, ours, and what became of them."""
     rows = []
     for each in judged:
-        ours = (
-            DASH if each.ours is None else signed(each.ours, each.claim.unit, each.claim.compares)
-        )
-        verdict = f"**{each.verdict}**: {each.reason}"
-        rows.append([each.claim.words, each.claim.theirs, ours, verdict])
+        claim, ours = each.claim, DASH
+        if each.ours is not None:
+            ours = signed(each.ours, claim.unit, claim.compares)
+        rows.append([claim.words, claim.theirs, ours, f"**{each.verdict}**: {each.reason}"])
     return Table("", ["claim", "paper", "ours (95 %)", "verdict"], rows, 4)
 
 
@@ -245,10 +245,15 @@ def goals_table(judged: Sequence[Verdict]) -> Table:
     for each in judged:
         goal = each.claim
         limit = f"{'≥' if goal.above else '≤'} {goal.limit:g} {goal.unit}".strip()
-        ours = DASH if each.ours is None else ends(each.ours, "{:.3g}".format)
+        ours = DASH if each.ours is None else _shortly(each.ours)
         cells = [goal.words, limit, f"**{each.verdict}**", ours]
         rows.append([cells[0], *(cell.replace("-", "−") for cell in cells[1:])])
     return Table("", ["goal", "limit", "verdict", "ours (95 %)"], rows, 3)
+
+
+def _shortly(found: Difference) -> str:
+    form = "{:.3g}".format
+    return form(found.mean) if found.low == found.high else ends(found, form)
 
 
 def as_json(each: Verdict) -> dict[str, Any]:

@@ -51,8 +51,8 @@ def _built(variant: Variant) -> Scenario:
 class Kind:
     """What a piece holds. ``compute``: "module:function" of a piece and progress, which returns
     arrays and facts; ``load``: the same of a variant, arrays and facts, which returns what they
-    are. ``code``: modules that it runs beside the agents' and the worlds'. ``together``: all agents in
-    one piece, with nothing else running (timings)."""
+    are. ``code``: modules that it runs beside those of agents and worlds. ``together``: all agents
+    in one piece, with nothing else running (timings)."""
 
     label: str
     compute: str

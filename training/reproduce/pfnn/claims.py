@@ -22,6 +22,7 @@ from training.reproduce.results import Need, Runs
 from training.reproduce.settings import Settings
 from training.reproduce.verdicts import (
     Claim,
+    Found,
     exactly,
     gain,
     gain_in,
@@ -238,8 +239,9 @@ def _learning() -> Iterator[Claim]:
     )  # fmt: skip
 
 
-def _loss(at: int) -> Callable[[Online], Difference | None]:
-    return lambda x: interval(x.loss[:, at]) if x.loss.shape[1] > at else None
+def _loss(at: int) -> Callable[[Online], Found]:
+    few = f"fewer than {at + 1} trainings"
+    return lambda x: interval(x.loss[:, at]) if x.loss.shape[1] > at else few
 
 
 def _online_gain(online: Online, apf: Runs) -> Difference:

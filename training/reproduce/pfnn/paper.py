@@ -85,7 +85,7 @@ TABLE_5 = {
     "pfnn": Expense(Spread(63.4, 6.7), 63.4, 178),
 }
 
-# Figure 2: ranges of the correction that were compared. The paper gives numbers of the proposed one only.
+# Figure 2: ranges of the correction that were compared; numbers are of the proposed one only.
 RANGES = ((0.2, 1.0), (0.3, 1.0), (0.4, 1.0), (0.5, 1.0), (0.4, 1.2), (0.4, 0.9))
 PROPOSED = (0.4, 1.0)
 

@@ -32,6 +32,7 @@ _MATRICES = {
     "nees": "NEES (ideal: 3; 2 in the plane)",
     "lost_uavs": "Lost UAVs, of all UAVs of all runs",
 }
+Compared = Callable[[Runs, Runs], Difference]
 _WORST = 30.0  # × the bound: what lies beyond has the same colour
 _SHOWN = ("apf", "pf_trust", "ekf_trust", _GATE, "ekf_joint")
 _SHADES = LinearSegmentedColormap.from_list("shades", (FLOOR, "#9ecae9", "#0072B2", "#0b1f3a"))
@@ -52,13 +53,13 @@ def goals(settings: Settings) -> Iterator[Goal]:
 
     def most(
         name: str, where: str, figure: str, words: str, limit: float, unit: str
-    ) -> Iterator[Goal]:  # noqa: E501
+    ) -> Iterator[Goal]:
         for agent in named(name):
             yield Goal(f"`{agent}`, {titles[where]}: {words}", unit, limit, False,
                        ((where, agent),), _figure(figure))  # fmt: skip
 
     def against(name: str, where: str, other: str, words: str, limit: float, unit: str,
-                of: Callable[[Runs, Runs], Difference], by: Any = "mean") -> Iterator[Goal]:  # fmt: skip
+                of: Compared, by: Any = "mean") -> Iterator[Goal]:  # fmt: skip
         for agent in named(name):
             yield Goal(f"`{agent}`, {titles[where]}: {words} `{other}`", unit, limit, False,
                        ((where, agent), (where, other)), of, by)  # fmt: skip
