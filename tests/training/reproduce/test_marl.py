@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from training.reproduce.marl.report import Figures
 
 from coloc_env.scenarios import parse_scenario
 from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
 from training.learning.registry import TRAININGS
 from training.reproduce.marl import plan, report, run
 from training.reproduce.marl.plan import Goal, Trained
-from training.reproduce.marl.report import Figures
 from training.reproduce.study import Variant
 
 TINY = (("worlds", 4), ("epochs", 2), ("steps", 5), ("passes", 1), ("minibatches", 1))

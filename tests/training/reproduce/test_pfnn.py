@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from training.reproduce.pfnn.flown import Flown
+from training.reproduce.pfnn.in_flight import InFlight
 from typer.testing import CliRunner, Result
 
 from coloc_env.bounds import Bound
@@ -18,8 +20,6 @@ from training.evaluation.results import Evaluation
 from training.reproduce.cost import Cost
 from training.reproduce.pfnn import goals, paper, report, robustness, tables
 from training.reproduce.pfnn.claims import verdicts
-from training.reproduce.pfnn.flown import Flown
-from training.reproduce.pfnn.in_flight import InFlight
 from training.reproduce.pfnn.plan import TABLE_AGENTS, ablation_agents, default, variants
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, Verdict
 

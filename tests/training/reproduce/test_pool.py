@@ -1,47 +1,16 @@
 """Units of work in processes that die: nothing hangs, nothing is left behind, nothing is lost."""
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
+from units import Unit
 
 from training.reproduce import pool
-
-
-@dataclass(frozen=True)
-class Unit:
-    """Writes a file; its process is killed the first ``kills`` times; it may raise, or wait."""
-
-    name: str
-    kills: int = 0
-    raises: bool = False
-    seconds: float = 0.0
-    size: int = 10
-
-    def settings(self) -> dict[str, Any]:
-        return {"name": self.name}
-
-    def done(self, out: Path) -> bool:
-        return (out / self.name).exists()
-
-    def run(self, out: Path, progress: Callable[[int], None]) -> None:
-        tried = len(list(out.glob(f"{self.name}.try-*")))
-        (out / f"{self.name}.try-{tried}-{os.getpid()}").touch()
-        progress(4)
-        if tried < self.kills:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.raises:
-            raise ZeroDivisionError("by nothing")
-        time.sleep(self.seconds)
-        progress(6)
-        (out / self.name).touch()
 
 
 def test_dead_processes_are_replaced_and_what_always_dies_is_reported(tmp_path: Path) -> None:
@@ -71,7 +40,7 @@ _PARENT = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_pool import Unit
+from units import Unit
 from training.reproduce import pool
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from training.reproduce.stdcl.flown import Flown
+from training.reproduce.stdcl.run import NAMES, reproduce
 from typer.testing import CliRunner
 
 from agents import make
@@ -20,11 +22,9 @@ from training.reproduce import pool
 from training.reproduce.cost import Cost
 from training.reproduce.stdcl import goals, links, plan, tables
 from training.reproduce.stdcl.claims import verdicts
-from training.reproduce.stdcl.flown import Flown
 from training.reproduce.stdcl.links import Event, Watched
 from training.reproduce.stdcl.measures import Runs, better, paired, told_by
 from training.reproduce.stdcl.plan import METHODS, OPTIMIZER, RIVALS, WHOLE, Plan, merged
-from training.reproduce.stdcl.run import NAMES, reproduce
 from training.reproduce.store import Store
 from training.reproduce.study import BOUNDS, WORLD, Study
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN
