@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-
-from training.reproduce.work import Unit
+if TYPE_CHECKING:
+    from training.reproduce.work import Unit
 
 _OFTEN = 0.5  # s between a worker's reports of its progress
 _ATTEMPTS = 2
@@ -126,10 +126,9 @@ def _next(left: list[Unit], attempts: dict[Unit, int]) -> Unit:
 
 
 def _serve(pipe: Connection) -> None:
-    """In a worker: one thread; the parent alone hears Ctrl-C, and its end is the worker's."""
+    """In a worker: the parent alone hears Ctrl-C, and its end is the worker's."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
     held, last = 0, 0.0
 
     def progress(size: int) -> None:

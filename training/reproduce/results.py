@@ -77,9 +77,8 @@ class Results:
         self.cells: dict[str, list[Cell]] = {}
         for cell in sorted(cells, key=lambda cell: -cell.runs):
             there = self.cells.setdefault(cell.name, [])
-            if cell.kind is None or all(
-                (c.kind, c.agents) != (cell.kind, cell.agents) for c in there
-            ):
+            alike = (c for c in there if (c.kind, c.agents) == (cell.kind, cell.agents))
+            if cell.kind is None or not any(alike):
                 there.append(cell)  # a bound over more runs serves for fewer
         counts: dict[str, set[int]] = {}
         for cell in every:

@@ -208,8 +208,8 @@ def _content(study: Study, parts: Sequence[Part], results: Results, folder: Path
         text = [verdicts.RULE, verdicts.counts(claims, "claims", kinds)]
         sections.append(_section("The paper's claims", text, [verdicts.claims_table(claims)]))
     if goals:
-        kinds = (verdicts.MET, verdicts.MISSED, verdicts.UNKNOWN)
-        text = [verdicts.GOAL_RULE, verdicts.counts(goals, "goals", kinds)]
+        found = verdicts.counts(goals, "goals", (verdicts.MET, verdicts.MISSED, verdicts.UNKNOWN))
+        text = [verdicts.GOAL_RULE, found]
         sections.append(_section("Our goals", text, [verdicts.goals_table(goals)]))
     for part in parts:
         tables = [table for table in part.tables(results) if table.rows]
@@ -230,8 +230,8 @@ def _content(study: Study, parts: Sequence[Part], results: Results, folder: Path
         "costs": _costs(results),
         "not_run": _not_run(results),
     }
-    found: dict[str, Any] = plain(content)
-    return found
+    values: dict[str, Any] = plain(content)
+    return values
 
 
 def _section(title: str, text: Iterable[str], tables: Sequence[Table]) -> dict[str, Any]:

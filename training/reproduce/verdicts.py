@@ -147,7 +147,7 @@ def decide(claim: Claim, ours: Found) -> Verdict:
 
 def _absent(needs: Sequence[Need]) -> str:
     """What is missing, by name."""
-    what = dict.fromkeys(need[1] or need[2].label for need in needs if need[1] or len(need) > 2)
+    what = dict.fromkeys(agent or rest[0].label for _, agent, *rest in needs)
     places = list(dict.fromkeys(need[0] for need in needs))
     more = " and others" if len(places) > 1 else ""
     return f"not run: {', '.join(what)} in {places[0]}{more}"

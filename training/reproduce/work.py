@@ -114,7 +114,8 @@ class Piece:
         return _store(out).has(self.name, self.settings())
 
     def run(self, out: Path, progress: Callable[[int], None]) -> None:
-        """Compute and store it; ``progress`` is given steps as they are done."""
+        """Compute and store it, on one thread; ``progress`` is given steps as they are done."""
+        torch.set_num_threads(1)
         before = 0
 
         def steps_done(what: str, done: int, total: int) -> None:
@@ -159,9 +160,10 @@ class Training:
         return (self.folder(out) / f"{self.training}.json").exists()
 
     def run(self, out: Path, progress: Callable[[int], None]) -> None:
-        """Train, or go on where it stopped."""
+        """Train, or go on where it stopped, on one thread."""
         from training.learning import run as trainings
 
+        torch.set_num_threads(1)
         folder = self.folder(out)
         if (folder / "run.json").exists():
             trainings.resume(folder, silent)

@@ -148,7 +148,7 @@ class _Report:
         """By variant's key, then filter or policy; those whose seeds are all there."""
         found: dict[str, dict[str, _Errors]] = {}
         for variant, policies in self.the.worlds:
-            names = {name: (name,) for name in (WORLD, *FILTERS)}
+            names: dict[str, tuple[str, ...]] = {name: (name,) for name in (WORLD, *FILTERS)}
             names |= {key: self._agents(results.settings, key) for key in policies}
             for name, agents in names.items():
                 there = tuple(results.runs(variant.key, agents).values())

@@ -170,7 +170,7 @@ def _calm_top(errors: Sequence[Floats]) -> float:
 def _of_case(number: int) -> Drawing:
     drawing: Any = update_wrapper(partial(case, number), case)
     drawing.__doc__ = f"Figure {4 + number}. {case.__doc__}"
-    return drawing  # type: ignore[no-any-return]
+    return drawing
 
 
 PAPER: dict[str, Drawing] = {
