@@ -69,19 +69,20 @@ def measure(
     """Cost of each agent over a run; an agent that raises a numerical error has none."""
     teams = {name: _Team(make(name, scenario), scenario, seed) for name in agents}
     ms: dict[str, list[float]] = {name: [] for name in agents}
+    warm_up = min(_WARM_UP, scenario.horizon)
     with _one_thread():
-        for k in range(_WARM_UP + scenario.horizon):
+        for k in range(warm_up + scenario.horizon):
             for name, team in list(teams.items()):
-                if k in (0, _WARM_UP):
+                if k in (0, warm_up):
                     team.start()
                 try:
                     spent = team.step()
                 except Breakdown:
                     del teams[name]
                     continue
-                if k >= _WARM_UP:
+                if k >= warm_up:
                     ms[name].append(spent)
-            progress("cost", k + 1, _WARM_UP + scenario.horizon)
+            progress("cost", k + 1, warm_up + scenario.horizon)
         return {
             name: Cost(np.array(ms[name]), team.last.belief.bytes(), _peak(team))
             for name, team in teams.items()

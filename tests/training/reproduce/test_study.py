@@ -261,6 +261,11 @@ def test_cost() -> None:
     assert many.working > few.working > 0
 
 
+def test_cost_of_runs_shorter_than_the_warm_up() -> None:
+    variant = Variant("short", "short", SMALL.overrides, steps=2)
+    assert measure(variant.build(), ["ekf"], 0, silent)["ekf"].ms.shape == (2,)
+
+
 def test_cost_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cell = Cell(SMALL, ("ekf", "test_still", "ekf:robust=hubr"), 1, COST)
     first, _ = run(tmp_path, cell)
