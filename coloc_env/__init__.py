@@ -12,10 +12,10 @@ import pettingzoo
 from coloc_env.scenarios import SCENARIOS, make_scenario
 
 if TYPE_CHECKING:
-    from coloc_env.envs.per_uav import PerUavEnv
+    from coloc_env.envs.gymnasium import SingleUavEnv
     from coloc_env.envs.pettingzoo import env, parallel_env
     from coloc_env.envs.sb3 import CoLocVecEnv
-    from coloc_env.envs.torchrl import CoLocEnv
+    from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
     from coloc_env.scenario import Scenario
     from coloc_env.world import World
 
@@ -25,6 +25,7 @@ __all__ = [
     "CoLocVecEnv",
     "PerUavEnv",
     "Scenario",
+    "SingleUavEnv",
     "World",
     "env",
     "make_scenario",
@@ -34,8 +35,9 @@ __all__ = [
 _HOMES = {  # loaded when asked for: TorchRL takes a second that PettingZoo's users need not wait
     "CoLocEnv": "coloc_env.envs.torchrl",
     "CoLocVecEnv": "coloc_env.envs.sb3",
-    "PerUavEnv": "coloc_env.envs.per_uav",
+    "PerUavEnv": "coloc_env.envs.torchrl",
     "Scenario": "coloc_env.scenario",
+    "SingleUavEnv": "coloc_env.envs.gymnasium",
     "World": "coloc_env.world",
     "env": "coloc_env.envs.pettingzoo",
     "parallel_env": "coloc_env.envs.pettingzoo",

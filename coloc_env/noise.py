@@ -72,7 +72,7 @@ def _random(
     """``count`` numbers per key: ``write`` turns random 32-bit integers into floats, in place."""
     words = (count + 1) // 2
     counters, flat = _counters(stream, words, keys.device), keys.reshape(-1, 1)
-    out = torch.empty(len(flat), count, device=keys.device)
+    out = torch.empty(len(flat), count, dtype=torch.float32, device=keys.device)
     rows = max(1, _CHUNK // words) if keys.device.type == "cpu" else max(1, len(flat))
     for start in range(0, len(flat), rows):
         bits = flat[start : start + rows] ^ counters

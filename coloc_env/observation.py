@@ -56,7 +56,7 @@ def prior_width(dim: int) -> int:
 
 
 def prior_action(observation: Observation, dim: int) -> Float32[Tensor, "B N A"]:
-    """What each UAV is told of its start, as an action."""
+    """What each UAV knows of its start, as an action."""
     prior = observation["prior"]
     return torch.cat((prior[..., : 2 * dim], prior[..., -2 - dim : -2].clamp_min(1e-6).log()), -1)
 
@@ -70,7 +70,7 @@ def static_leaves(scenario: Scenario) -> dict[str, Leaf]:
 
 
 def sensed_leaves(scenario: Scenario) -> dict[str, Leaf]:
-    """Leaves sensed anew at each step, messages aside."""
+    """Leaves sensed at each step, messages aside."""
     slots = scenario.layout.slots
     leaves: dict[str, Leaf] = {}
     for sensor in scenario.sensors:
@@ -118,7 +118,7 @@ def action_bounds(arena: Arena) -> tuple[list[float], list[float]]:
     """Bounds of the flat action: twice the arena's extent, log-std within ±10, and ±50 m/s, or so
     much as crosses the arena's longest side in 50 s.
 
-    They describe where sensible estimates lie (and what samples look like); a finite estimate
+    They describe where sensible estimates lie (and samples are drawn from); a finite estimate
     beyond them is scored, not refused.
     """
     low, high = [], []

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
-from scipy.signal import lfilter
 from torch import Tensor
 
 from coloc_env import noise
@@ -48,6 +47,8 @@ class SatelliteReference:
         white = drawn.double().numpy().reshape(*keys.shape, n_uavs + 1, dim)
         kept = math.exp(-dt / self.time)
         white[:, 1:] *= math.sqrt(1 - kept**2)
+        from scipy.signal import lfilter  # takes seconds, and few scenarios need it
+
         wander = lfilter([1.0], [1.0, -kept], white, axis=1)
         own, common = wander[..., :-1, :], wander[..., -1:, :]
         axes = np.array([1.0, 1.0, self.vertical][:dim]) * self.cep / _CEP

@@ -11,6 +11,7 @@ import importlib.util
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -112,12 +113,21 @@ def _points(group: str) -> list[EntryPoint]:
     return sorted(entry_points(group=group), key=lambda point: point.name)
 
 
+def _located(module: str) -> ModuleSpec | None:
+    """Where a module is, without importing the packages that it lies in; None if nowhere."""
+    spec, path, name = None, None, ""
+    for part in module.split("."):
+        name = f"{name}.{part}" if name else part
+        spec = importlib.util.find_spec(name) if path is None else PathFinder.find_spec(name, path)
+        if spec is None:
+            return None
+        path = spec.submodule_search_locations
+    return spec
+
+
 def _docstring(module: str, attribute: str) -> str:
     """The docstring of a module's function or class, from its source; empty if there is none."""
-    try:
-        spec = importlib.util.find_spec(module)
-    except ImportError:
-        return ""
+    spec = _located(module)
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return ""
     with open(spec.origin, encoding="utf-8") as file:

@@ -14,7 +14,7 @@ def reward(
     error: Float32[Tensor, "B N"],
     scored: Bool[Tensor, "B N"],
 ) -> Float32[Tensor, "B N"]:
-    """Reward of each UAV, 0 where it is not scored.
+    """Reward of each UAV, 0 where it is not scored (whatever its estimate, NaN included).
 
     - ``error``: −‖p̂ − p‖ in m (the default);
     - ``squared``: −‖p̂ − p‖² in m²;
@@ -30,7 +30,7 @@ def reward(
         total = error[:, 0]
         for column in error.unbind(1)[1:]:
             total = total + column
-        return -(total.unsqueeze(-1) / count) * scored
+        return torch.where(scored, -(total.unsqueeze(-1) / count), 0.0)
     dim = position.shape[-1]
     log_std = estimates[..., 2 * dim :]
     scaled = (estimates[..., :dim] - position).to(torch.float32) / log_std.exp()
@@ -38,4 +38,4 @@ def reward(
     total = terms[..., 0]
     for column in terms.unbind(-1)[1:]:
         total = total + column
-    return total * scored
+    return torch.where(scored, total, 0.0)

@@ -1,7 +1,7 @@
 """Sensing a window: truth, network and every sensor, for some rows over some steps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -14,7 +14,7 @@ from coloc_env.geometry import rotate_by
 from coloc_env.motion import Carry, Kinematics
 from coloc_env.observation import action_width
 from coloc_env.scenario import Prior, Scenario
-from coloc_env.sensors.base import Window
+from coloc_env.sensors.base import Window, in_slots
 
 
 class _Rows:
@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 
     ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
     on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
-    ``senders[…, s]`` (None: from UAV s); ``heard`` says where one gets through, ``unheard`` which
+    ``senders[…, s]`` (None: from UAV s); ``heard`` is where one gets through, ``unheard`` which
     of all slots' numbers stay 0.
     """
 
@@ -97,12 +97,6 @@ class Sensed(_Rows):
         return [Frame(*views) for views in zip(*cut, strict=True)]
 
     @cached_property
-    def leaf_frames(self) -> list[dict[str, Float32[Tensor, "R N F"]]]:
-        """The leaves of the window's steps one by one."""
-        parts = (leaf.unbind(1) for leaf in self.leaves.values())
-        return [dict(zip(self.leaves, views, strict=True)) for views in zip(*parts, strict=True)]
-
-    @cached_property
     def states(self) -> Float32[Tensor, "R K S"]:
         """The truth, flat: per UAV position, velocity, attitude, alive, scored."""
         flags = torch.stack((self.alive, self.scored), -1)
@@ -115,7 +109,7 @@ class Sensed(_Rows):
         return bool(self.scored.all())
 
     def __getstate__(self) -> dict[str, Any]:
-        """The tensors alone: views are cut anew after a copy."""
+        """The tensors alone: views are cut again after a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
@@ -175,15 +169,16 @@ def sense(
             for by in delays
         },
     )
+    seen = window if moved.valid is None else _where_known(window, moved.valid)
     leaves: dict[str, Tensor] = {}
     for sensor, own in zip(scenario.sensors, placed, strict=True):
-        leaves |= sensor.sample(window, own)
+        leaves |= sensor.sample(seen if sensor.may_be_blind else window, own)
     heard = network.links(step_keys, neighbours, reach)
     leaves["links"] = heard.to(torch.float32)
     dense = network.dense(arena.n_uavs)
     scored = alive if moved.valid is None else alive & moved.valid
-    if scenario.guides:
-        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.guides)
+    if scenario.anchor_uavs:
+        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.anchor_uavs)
     if not dense:
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
     sensed = Sensed(
@@ -204,6 +199,15 @@ def sense(
     return sensed, carry, whole.map(lambda x: x[:, -lead:])
 
 
+def _where_known(window: Window, valid: Bool[Tensor, "R K N"]) -> Window:
+    """The window for sensors that are simulated on a recording: where its truth has a hole they
+    would measure what was never there, so there they measure nothing."""
+    other = in_slots(valid, window.neighbours)
+    return replace(
+        window, alive=window.alive & valid, reach=window.reach & valid.unsqueeze(-1) & other
+    )
+
+
 def _join(before: Tensor, now: Tensor) -> Tensor:
     """Steps one after the other, each component contiguous in memory: what sensors compute with."""
     return torch.cat((before.movedim(-1, 0), now.movedim(-1, 0)), 2).movedim(0, -1)
@@ -212,7 +216,7 @@ def _join(before: Tensor, now: Tensor) -> Tensor:
 def draw_prior(
     prior: Prior, keys: Int64[Tensor, "B"], truth: Kinematics, scenario: Scenario
 ) -> Float32[Tensor, "B N F"]:
-    """What each UAV is told of its own start: mean position, velocity, attitude, and their
+    """What each UAV knows of its own start: mean position, velocity, attitude, and their
     standard deviations (position per axis, velocity, attitude)."""
     arena = scenario.arena
     n, dim = truth.position.shape[1:]

@@ -6,7 +6,7 @@ the same seed exactly, however many rows share the batch and however many steps 
 
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -17,18 +17,21 @@ from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation, action_width, static_leaves
 from coloc_env.rewards import reward
 from coloc_env.scenario import Scenario
+from coloc_env.seeding import checked_seeds
 from coloc_env.sensing import Frame, Past, Sensed, draw_prior, sense
 
 _AGENT_STEPS = 12288  # (row, step, UAV) items sensed at once: more would not be faster
 _LONGEST = 512  # steps sensed ahead at most: a reset throws away what was not used
 _NEVER = 1 << 62
 
+Leaves = dict[str, Float32[Tensor, "B *K N F"]]
+
 
 class Step(NamedTuple):
     """What one step of the world brings.
 
     ``error`` is the position error in m of the estimates just scored, 0 where ``scored`` is False
-    (a guide, a failed UAV, or a recording without truth at that moment).
+    (an anchor UAV, a failed UAV, or a recording without truth at that moment).
     """
 
     reward: Float32[Tensor, "B N"]
@@ -42,7 +45,8 @@ class World:
     """B worlds of one scenario in lock-step.
 
     ``window``: how many steps are sensed ahead (default: as many as pay); it changes no number.
-    Nothing handed out is ever written to again.
+    Observations handed out are never written to again, and what is done to them in place changes
+    nothing that the world goes on with.
     """
 
     sensed: Sensed
@@ -70,7 +74,8 @@ class World:
         self._width = action_width(scenario)
         self._static_names = tuple(static_leaves(scenario))
         self.cursor = -1
-        self._zero = torch.zeros((), device=self.device)
+        self._zero = torch.zeros((), dtype=torch.float32, device=self.device)
+        self._observed: Sensed | None = None
         self._sent: deque[Tensor] = deque(maxlen=self._delay + 1)
 
     # ---------------------------------------------------------------- reset
@@ -78,17 +83,13 @@ class World:
     def reset(
         self, seeds: Int64[Tensor, "B"] | Sequence[int] | int, rows: Bool[Tensor, "B"] | None = None
     ) -> Observation:
-        """Start the rows marked in ``rows`` (default: all) anew and return the observation.
+        """Restart the rows marked in ``rows`` (default: all) and return the observation.
 
         ``seeds``: one per row, or one integer s for rows seeded s, s+1, …; those of other rows are
-        ignored.
+        ignored. Raises ValueError for another number of seeds, and for one that is not a whole
+        number from 0 to 2⁶².
         """
-        b = self.batch_size
-        if isinstance(seeds, int):
-            seeds = torch.arange(seeds, seeds + b)
-        seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.device)
-        if seeds.shape != (b,):
-            raise ValueError(f"World: {b} seeds are needed, one a row, got {tuple(seeds.shape)}")
+        seeds = checked_seeds(seeds, self.batch_size, self.device)
         if rows is None or self.cursor < 0 or bool(rows.all()):
             self.seeds = seeds.clone()
             self._sent.clear()
@@ -110,7 +111,7 @@ class World:
         self._static: dict[str, Tensor] = {}
         for sensor, placed in zip(scenario.sensors, self._placed, strict=True):
             for name, value in sensor.map_values(placed).items():
-                self._static[name] = value.unsqueeze(1).expand(-1, n, -1).contiguous()
+                self._static[name] = value.unsqueeze(1).repeat(1, n, 1)
 
     def _failures(self, keys: Int64[Tensor, "R"]) -> Int64[Tensor, "R N"]:
         """The step at which each UAV fails; one that is never reached if it does not."""
@@ -201,7 +202,9 @@ class World:
         """
         now, dim = self.now, self.scenario.arena.dim
         error = torch.linalg.vector_norm(estimates[..., :dim] - now.target, dim=-1)
-        return error if self.sensed.all_scored else error * now.scored, now.scored
+        if not self.sensed.all_scored:  # chosen, not multiplied: nobody's NaN counts as 0
+            error = torch.where(now.scored, error, self._zero)
+        return error, now.scored
 
     def advance(self, estimates: Float32[Tensor, "B N A"]) -> None:
         """Send (copies of) the estimates as messages and move to the next step."""
@@ -241,10 +244,10 @@ class World:
 
     def state(self) -> Float32[Tensor, "B S"]:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""
-        return self.sensed.states[:, self.cursor]
+        return self.sensed.states[:, self.cursor].clone()
 
     def messages(self) -> tuple[Float32[Tensor, "B N F"], Float32[Tensor, "B N S"]]:
-        """Delivered messages and their mask: what senders' actions said 1 + delay steps ago."""
+        """Delivered messages and their mask: senders' actions of 1 + delay steps ago."""
         now = self.now
         if len(self._sent) <= self._delay:
             b, n, slots = now.heard.shape
@@ -259,16 +262,35 @@ class World:
             rows = torch.arange(len(sent), device=self.device)[:, None, None]
             content = sent[rows, now.senders].flatten(-2)
         # Chosen, not multiplied: a diverged sender's NaN reaches only those who hear it.
-        return torch.where(unheard, self._zero, content), heard
+        return torch.where(unheard, self._zero, content), heard.clone()
 
     def observation(self) -> Observation:
         """What every UAV observes at the current step."""
+        if self._observed is not self.sensed:
+            self._observed = self.sensed
+            self._frames = self._leaf_frames()
         messages, mask = self.messages()
-        return Observation(
-            {
-                **self.sensed.leaf_frames[self.cursor],
-                "messages": messages,
-                "message_mask": mask,
-                **self.static,
-            }
-        )
+        leaves, static = self._frames[self.cursor]
+        return Observation({**leaves, "messages": messages, "message_mask": mask, **static})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the copies: each view would bring its whole window along."""
+        state = {k: v for k, v in self.__dict__.items() if k != "_frames"}
+        return {**state, "_observed": None}
+
+    def _leaf_frames(self) -> list[tuple[Leaves, Leaves]]:
+        """Leaves sensed and static of each step in the window.
+
+        Copies, so that edits in place by those who observe reach no other step, and cut in one go:
+        far cheaper than one step at a time.
+        """
+        count = self.sensed.count
+        leaves = {name: leaf.clone() for name, leaf in self.sensed.leaves.items()}
+        static = {k: v.unsqueeze(1).repeat(1, count, 1, 1) for k, v in self.static.items()}
+        return list(zip(_by_step(leaves), _by_step(static), strict=True))
+
+
+def _by_step(window: Leaves) -> list[Leaves]:
+    """Leaves [B, K, N, F] as K times leaves [B, N, F]."""
+    parts = (leaf.unbind(1) for leaf in window.values())
+    return [dict(zip(window, views, strict=True)) for views in zip(*parts, strict=True)]

@@ -1,6 +1,6 @@
-"""Robust pose graph over a team's whole history, solved by GTSAM: the reference that sees all.
+"""Robust pose graph over a team's whole history, solved by GTSAM: the reference with all data.
 
-Loops over worlds are Python's here; everything else in this package is batched.
+Worlds are solved one by one.
 """
 
 from collections.abc import Sequence
@@ -13,36 +13,39 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.localizer import Estimate
-from agents.stein import reckoning
+from agents.stein import odometry
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
+from coloc_env.options import PositiveCount
 from coloc_env.scenario import Believed
 
 Robust = Literal["huber", "gnc", "none"]
 
 _HUBER = 1.345  # standard deviations beyond which Huber's loss is linear
-_TIGHT = 1e-4  # m, rad: what counts as no noise
+_TIGHT = 1e-4  # m, rad: of variables that are fixed
 _INLIER = 0.99  # probability that GNC keeps a match that is right
-_CLOSE = (0.5, 0.35)  # m, rad: matches that agree, when the graph is first laid out
+_CLOSE = (0.5, 0.35)  # m, rad: matches that agree in the initial estimate
 
 
-class History(TensorClass):
-    """Each UAV's track by odometry [T steps], the matches it was told in each, the estimate
-    relative to UAV 0 and the covariance of its position in its body frame; batch (B, N)."""
+class PoseGraphBelief(TensorClass):
+    """Each UAV's ``track`` by odometry over T steps, the M ``matches`` of each step with their
+    ``ends`` and ``mask``, the ``estimate`` relative to UAV 0 and the ``covariance`` of its position
+    in its body frame (m²); batch (B, N)."""
 
     track: Float64[Tensor, "B N T P"]
     ends: Int64[Tensor, "B N T M 2"]
     matches: Float64[Tensor, "B N T M P"]
-    told: Bool[Tensor, "B N T M"]
+    mask: Bool[Tensor, "B N T M"]
     estimate: Float64[Tensor, "B N P"]
     covariance: Float64[Tensor, "B N d d"]
     step: Int64[Tensor, "B N"]
 
 
 @dataclass(frozen=True)
-class _Graph:
-    """One world's odometry [N, T−1] and matches, each once, with the steps they belong to."""
+class _Factors:
+    """One world's odometry factors [N, T−1], its matches, each once (UAVs ``first`` and ``second``
+    in step ``at``), and an initial estimate of all poses (``start``)."""
 
     odometry: Float64[Tensor, "N S P"]
     first: list[int]
@@ -52,38 +55,38 @@ class _Graph:
     start: Float64[Tensor, "N T P"]
 
 
-class PoseGraph(RelativeTeam[History]):
+class PoseGraph(RelativeTeam[PoseGraphBelief]):
     """All poses of all UAVs at all steps, from all odometry and matches, whatever the network.
 
     ``robust``: Huber's loss on matches, ``gnc`` (graduated non-convexity with truncated least
-    squares, Yang et al. 2020), or ``none``. Solved anew at every ``every``-th step, and carried on
+    squares, Yang et al. 2020), or ``none``. Solved at every ``every``-th step, and propagated
     by odometry in between. Needs GTSAM (``pip install coloc[graph]``).
     """
 
     name = "pose_graph"
     centralized = True
 
-    def __init__(self, believed: Believed, *, robust: Robust = "huber", every: int = 10) -> None:
+    def __init__(
+        self, believed: Believed, *, robust: Robust = "huber", every: PositiveCount = 10
+    ) -> None:
         super().__init__(believed, 0.2, 1.0)
-        if every < 1:
-            raise ValueError(f"every={every} is not allowed: at least 1")
         try:
             import gtsam
         except ImportError as error:
             raise ValueError("GTSAM is missing: pip install coloc[graph]") from error
         self.gtsam, self.robust, self.every = gtsam, robust, every
 
-    def reset(self, observation: Observation) -> History:
+    def reset(self, observation: Observation) -> PoseGraphBelief:
         b, n = observation.batch_size
         poses, m = self.poses, self.matches.matches
         origin = observation["reference"].double()
         at = poses.identity(origin)
         zero = torch.zeros(b, n, dtype=torch.int64, device=origin.device)
-        return History(
+        return PoseGraphBelief(
             track=at.expand(b, n, 0, -1),
             ends=zero[..., None, None, None].expand(b, n, 0, m, 2),
             matches=at.expand(b, n, 0, m, -1),
-            told=zero[..., None, None].bool().expand(b, n, 0, m),
+            mask=zero[..., None, None].bool().expand(b, n, 0, m),
             estimate=at.expand(b, n, -1).clone(),
             covariance=torch.diag(origin.new_tensor(self.uniform[: poses.dim])).expand(
                 b, n, -1, -1
@@ -92,28 +95,30 @@ class PoseGraph(RelativeTeam[History]):
             batch_size=(b, n),
         )
 
-    def step(self, belief: History, observation: Observation) -> tuple[History, Estimate]:
+    def step(
+        self, belief: PoseGraphBelief, observation: Observation
+    ) -> tuple[PoseGraphBelief, Estimate]:
         poses, m = self.poses, self.matches.matches
         dt = (belief.step > 0).double() * self.believed.arena.dt
-        moved = reckoning.increments(poses, observation, dt)
+        moved = odometry.increments(poses, observation, dt)
         before = belief.track[:, :, -1] if belief.track.shape[2] else belief.estimate
         pose = observation["relative_poses"].double().unflatten(-1, (m, poses.size))
-        told = (observation["relative_pose_mask"] > 0) & pose.isfinite().all(-1)
-        pose = torch.where(told.unsqueeze(-1), pose, poses.identity(pose))
+        mask = (observation["relative_pose_mask"] > 0) & pose.isfinite().all(-1)
+        pose = torch.where(mask.unsqueeze(-1), pose, poses.identity(pose))
         ends = observation["relative_pose_ends"].unflatten(-1, (m, 2))
-        ends = torch.where(told.unsqueeze(-1), ends, 0.0).to(torch.int64)
+        ends = torch.where(mask.unsqueeze(-1), ends, 0.0).to(torch.int64)
 
-        def with_now(past: Tensor, now: Tensor) -> Tensor:
-            return torch.cat((past, now.unsqueeze(2)), 2)
+        def append(steps: Tensor, new: Tensor) -> Tensor:
+            return torch.cat((steps, new.unsqueeze(2)), 2)
 
         after = build(
-            History,
+            PoseGraphBelief,
             belief.step.shape,
-            track=with_now(belief.track, poses.compose(before, moved)),
-            ends=with_now(belief.ends, ends),
-            matches=with_now(belief.matches, pose),
-            told=with_now(belief.told, told),
-            estimate=reckoning.carried(poses, belief.estimate, moved),
+            track=append(belief.track, poses.compose(before, moved)),
+            ends=append(belief.ends, ends),
+            matches=append(belief.matches, pose),
+            mask=append(belief.mask, mask),
+            estimate=odometry.propagate(poses, belief.estimate, moved),
             covariance=belief.covariance,
             step=belief.step + 1,
         )
@@ -122,41 +127,47 @@ class PoseGraph(RelativeTeam[History]):
             estimate, covariance = (torch.stack(part) for part in zip(*solved, strict=True))
             after = after.replace(estimate=estimate, covariance=covariance)
         origin = observation["reference"].double()
-        return after, self.said(after.estimate, after.covariance, origin, observation, dt > 0)
+        return after, self.world_estimate(
+            after.estimate, after.covariance, origin, observation, dt > 0
+        )
 
-    def team(self, belief: History) -> Float[Tensor, "B H N P"]:
+    def team(self, belief: PoseGraphBelief) -> Float[Tensor, "B H N P"]:
         n = belief.step.shape[1]
         return belief.estimate.unsqueeze(1).expand(-1, n, -1, -1)
 
     # ---------------------------------------------------------------- one world's graph
 
-    def _solved(self, row: History) -> tuple[Float64[Tensor, "N P"], Float64[Tensor, "N d d"]]:
-        """Poses relative to UAV 0's last one, and their positions' covariances."""
-        one, gtsam = self._graph(row), self.gtsam
-        n, steps = one.start.shape[:2]
+    def _solved(
+        self, row: PoseGraphBelief
+    ) -> tuple[Float64[Tensor, "N P"], Float64[Tensor, "N d d"]]:
+        """Poses relative to UAV 0's last one, and the marginal covariances of their positions."""
+        factors, gtsam = self._factors(row), self.gtsam
+        n, steps = factors.start.shape[:2]
         graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
         kind = "Pose3" if self.poses.dim == 3 else "Pose2"
         prior, between = (getattr(gtsam, f"{f}Factor{kind}") for f in ("Prior", "Between"))
-        tight = gtsam.noiseModel.Isotropic.Sigma(self.poses.dof, _TIGHT)
-        graph.add(prior(steps - 1, self._to_gtsam(one.start[0, -1]), tight))
-        anywhere = self._noise([variance**0.5 for variance in self.uniform])
+        exact = gtsam.noiseModel.Isotropic.Sigma(self.poses.dof, _TIGHT)
+        graph.add(prior(steps - 1, self._to_gtsam(factors.start[0, -1]), exact))
+        uniform = self._noise([variance**0.5 for variance in self.uniform])
         odometry = self._noise(self.std)
         for uav in range(n):
             for k in range(steps):
-                initial.insert(uav * steps + k, self._to_gtsam(one.start[uav, k]))
+                initial.insert(uav * steps + k, self._to_gtsam(factors.start[uav, k]))
             if uav:
-                here = self.poses.identity(one.start)
-                graph.add(prior(uav * steps + steps - 1, self._to_gtsam(here), anywhere))
+                identity = self.poses.identity(factors.start)
+                graph.add(prior(uav * steps + steps - 1, self._to_gtsam(identity), uniform))
             for k in range(steps - 1):
                 key = uav * steps + k
-                graph.add(between(key, key + 1, self._to_gtsam(one.odometry[uav, k]), odometry))
+                graph.add(between(key, key + 1, self._to_gtsam(factors.odometry[uav, k]), odometry))
         known = graph.size()
         d, turns = self.poses.dim, self.poses.dof - self.poses.dim
         match = self._noise([self.matches.std] * d + [self.matches.turn_std] * turns)
         if self.robust == "huber":
             loss = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
             match = gtsam.noiseModel.Robust.Create(loss, match)
-        for i, j, k, pose in zip(one.first, one.second, one.at, one.pose, strict=True):
+        for i, j, k, pose in zip(
+            factors.first, factors.second, factors.at, factors.pose, strict=True
+        ):
             graph.add(between(i * steps + k, j * steps + k, self._to_gtsam(pose), match))
         values, graph = self._optimized(graph, initial, known)
         keys = [uav * steps + steps - 1 for uav in range(n)]
@@ -168,7 +179,7 @@ class PoseGraph(RelativeTeam[History]):
         return estimate, torch.stack(covariance).to(estimate.dtype)
 
     def _optimized(self, graph: Any, initial: Any, known: int) -> tuple[Any, Any]:
-        """The solution, and the graph whose curvature is its information."""
+        """The solution, and the graph of the inliers, whose Hessian is its information."""
         gtsam = self.gtsam
         if self.robust != "gnc" or graph.size() == known:
             return gtsam.LevenbergMarquardtOptimizer(graph, initial).optimize(), graph
@@ -184,25 +195,25 @@ class PoseGraph(RelativeTeam[History]):
                 kept.add(graph.at(index))
         return values, kept
 
-    def _graph(self, row: History) -> _Graph:
-        """The factors, and where to start: each UAV's track, hung on UAV 0's by those matches that
-        most others between the same two agree with."""
+    def _factors(self, row: PoseGraphBelief) -> _Factors:
+        """The factors, and an initial estimate: each UAV's track, placed relative to UAV 0's by the
+        matches that most others between the same two UAVs agree with."""
         poses, n = self.poses, row.track.shape[0]
         uav = torch.arange(n, device=row.track.device)[:, None, None]
-        once = row.told & (row.ends[..., 0] == uav)
+        once = row.mask & (row.ends[..., 0] == uav)
         index = once.nonzero()
         first, second = row.ends[once].unbind(-1)
         at, pose = index[:, 1], row.matches[once]
         to_now = poses.between(row.track, row.track[:, -1:])  # [N, T, P]: D from then to now
         present = poses.between(to_now[first, at], poses.compose(pose, to_now[second, at]))
-        hung = self._layout(first.tolist(), second.tolist(), present, n)
+        placed = self._layout(first.tolist(), second.tolist(), present, n)
         if not any(self.std):  # exact odometry makes one unknown of all of a UAV's poses
             still = [0] * len(pose)
             ends = first.tolist(), second.tolist()
-            return _Graph(row.track[:, :0], *ends, still, present, hung.unsqueeze(1))
-        start = poses.compose(hung.unsqueeze(1), poses.inverse(to_now))
+            return _Factors(row.track[:, :0], *ends, still, present, placed.unsqueeze(1))
+        start = poses.compose(placed.unsqueeze(1), poses.inverse(to_now))
         odometry = poses.between(row.track[:, :-1], row.track[:, 1:])
-        return _Graph(odometry, first.tolist(), second.tolist(), at.tolist(), pose, start)
+        return _Factors(odometry, first.tolist(), second.tolist(), at.tolist(), pose, start)
 
     def _layout(
         self, first: Sequence[int], second: Sequence[int], pose: Float64[Tensor, "C P"], n: int

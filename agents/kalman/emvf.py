@@ -76,6 +76,8 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self.reckoning = DeadReckoning(believed)
         self.process: Process = self.reckoning.process
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
+        if not self.models:
+            raise ValueError("needs measurements of landmarks or anchors, and the team has none")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
 

@@ -35,7 +35,7 @@ class GaussianBelief(TensorClass):
 
 def elapsed(process: Process, step: Int64[Tensor, "B N"]) -> Float[Tensor, "B N"]:
     """Seconds since the belief's step: none before the first observation."""
-    return (step > 0) * process.dt
+    return (step > 0).to(torch.float32) * process.dt
 
 
 def predict(

@@ -23,7 +23,8 @@ def degenerate(
 ) -> Bool[Tensor, "B N"]:
     """Whether weights are those of too few particles: an effective sample size below half of the
     count in the first steps, below a tenth later."""
-    share = torch.where(belief.step < _START, RESAMPLE, _FEW)
+    share = torch.full_like(belief.step, _FEW, dtype=torch.float32)
+    share = share.masked_fill(belief.step < _START, RESAMPLE)
     return effective_sample_size(log_weights) < share * belief.count
 
 

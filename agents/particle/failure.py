@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float32
-from scipy.stats import chi2
 from torch import Tensor
 from torch.nn import functional
 
 from agents.models.measurements import AnchorRanges, nobody
 from agents.models.process import Process
+from agents.robust.mahalanobis import chi_square
 from agents.weights import Learned
 from coloc_env.observation import Observation
 
@@ -64,8 +64,8 @@ class ChiSquare(Detector):
     def __init__(self, quantile: float, most: int) -> None:
         if not 0 < quantile < 1:
             raise ValueError(f"quantile={quantile} is not allowed: a probability in (0, 1)")
-        limits = chi2.ppf(quantile, range(1, most + 1))
-        self.limits = torch.tensor((torch.inf, *limits))
+        limits = [chi_square(quantile, dof) for dof in range(1, most + 1)]
+        self.limits = torch.tensor((torch.inf, *limits), dtype=torch.float32)
 
     def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
         limits = self.limits.to(seen.count.device)[seen.count.long()]

@@ -50,7 +50,7 @@ def landmark_log_likelihood(
     assert rotation is not None
     turn = rotation.flatten(-2) - at.flatten(-2).unsqueeze(-2)
     # ΔR enters through ΔR Σz and tr(ΔR Σ z Lᵀ): one product with a [d², d + 1] matrix.
-    by_row = torch.zeros(*sum_z.shape[:-1], d, d, d + 1, device=z.device)
+    by_row = torch.zeros(*sum_z.shape[:-1], d, d, d + 1, dtype=torch.float32, device=z.device)
     for row in range(d):
         by_row[..., row, :, row] = sum_z
     by_row[..., d] = points.mT @ z

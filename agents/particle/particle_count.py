@@ -16,7 +16,8 @@ def adapted(
     """Equation 17: 100 more where the effective sample size is below 0.3 of the count, 50 fewer
     where it is above 0.8, within bounds."""
     more, fewer = (count + GROW).clamp_max(bounds[1]), (count - SHRINK).clamp_min(bounds[0])
-    return torch.where(ess < _FEW * count, more, torch.where(ess > _MANY * count, fewer, count))
+    number = count.to(torch.float32)
+    return torch.where(ess < _FEW * number, more, torch.where(ess > _MANY * number, fewer, count))
 
 
 def alive(count: Int64[Tensor, "B N"], slots: int) -> Bool[Tensor, "B N M"]:

@@ -1,6 +1,8 @@
 """One bootstrap particle filter over a whole team's relative poses (Gordon, Salmond & Smith 1993):
 what the collaborative Stein particle filter is measured against."""
 
+from typing import Annotated
+
 import torch
 from jaxtyping import Float, Float64, Int64
 from tensordict import TensorClass
@@ -9,13 +11,14 @@ from torch import Tensor
 from agents.localizer import Estimate
 from agents.particle.belief import normal, own_keys
 from agents.particle.cloud import effective_sample_size, systematic
-from agents.stein import reckoning
-from agents.stein import window as windows
-from agents.stein.likelihood import Scale, compare, factors, outlier_level
+from agents.stein import match_window as windows
+from agents.stein import odometry
+from agents.stein.likelihood import Scale, factors, outlier_level, residuals
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
+from coloc_env.options import OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 _ROUGH = 0.2  # of the annealed scale: what resampled particles are moved by
@@ -48,21 +51,17 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         self,
         believed: Believed,
         *,
-        particles: int = 150,
-        anneal: float = 0.0,
-        outliers: float = 0.2,
+        particles: Annotated[int, Quantity("", 2)] = 150,
+        anneal: Annotated[float, Quantity("", 0.0, below=1.0)] = 0.0,
+        outliers: OpenShare = 0.2,
         seed: int = 0,
     ) -> None:
-        if not 0 <= anneal < 1:
-            raise ValueError(f"anneal={anneal} is not allowed: a factor in [0, 1)")
         super().__init__(believed, outliers, anneal or 1.0)
-        if particles < 2:
-            raise ValueError(f"particles={particles} is not allowed: at least 2")
         self.particles, self.annealing, self.seed = particles, anneal > 0, seed
 
     def reset(self, observation: Observation) -> TeamCloud:
         key, origin = own_keys(observation, self.seed), observation["reference"].double()
-        x = self.anywhere(key, origin, 1, self.particles)[:, :, 0]
+        x = self.uniform_poses(key, origin, 1, self.particles)[:, :, 0]
         first = torch.arange(key.shape[1], device=key.device) == 0
         x = torch.where(first[:, None, None], self.poses.identity(x), x)
         return TeamCloud(
@@ -79,10 +78,10 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         poses, n = self.poses, belief.step.shape[1]
         key = noise.fold(belief.key, belief.step)
         dt = (belief.step > 0).double() * self.believed.arena.dt
-        moved = reckoning.increments(poses, observation, dt).unsqueeze(2)
+        moved = odometry.increments(poses, observation, dt).unsqueeze(2)
         spread = (belief.step > 0)[..., None, None] * self._draws(key, "pf_joint.step", self.std)
         moved = poses.plus(moved, spread)
-        x = reckoning.carried(poses, belief.x.transpose(1, 2), moved.transpose(1, 2))
+        x = odometry.propagate(poses, belief.x.transpose(1, 2), moved.transpose(1, 2))
         scale = self._scale(belief.step[:, :1])
         log_weights = belief.log_weights + self._log_likelihood(x, observation, scale)
         log_weights = log_weights.log_softmax(-1)
@@ -111,7 +110,7 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
             step=belief.step + 1,
         )
         origin = observation["reference"].double()
-        return after, self.said(estimate, spread, origin, observation, dt > 0)
+        return after, self.world_estimate(estimate, spread, origin, observation, dt > 0)
 
     def team(self, belief: TeamCloud) -> Float[Tensor, "B H N P"]:
         n = belief.step.shape[1]
@@ -136,13 +135,13 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         """Of this step's matches, a mixture of Gaussian ones and uniform outliers."""
         poses, n = self.poses, x.shape[2]
         everyone = torch.ones_like(observation["links"][..., :n], dtype=torch.bool)
-        new = windows.matches(poses, observation, everyone, True)
+        new = windows.observed_matches(poses, observation, everyone, True)
         new = windows.Matches(*(part[:, :1] for part in vars(new).values()))
-        empty = windows.empty(poses, new.told.shape[:2], new.told.shape[-1], x)
-        window = windows.stored(empty, new)
+        empty = windows.empty(poses, new.mask.shape[:2], new.mask.shape[-1], x)
+        window = windows.insert(empty, new)
         beta = outlier_level(poses, scale, self.outliers, self.volume)
         known = factors(poses, window, scale, n)
-        return compare(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta)[2]
+        return residuals(poses, x.transpose(1, 2).unsqueeze(1), window, known, scale, beta)[2]
 
     def _moments(
         self, x: Float64[Tensor, "B N m P"], log_weights: Float64[Tensor, "B N m"]

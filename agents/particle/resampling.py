@@ -95,7 +95,7 @@ class Renewal:
     @staticmethod
     def few(weighed: Weighed, count: Int64[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
         """Whose effective sample size is low."""
-        return weighed.ess < RESAMPLE * count
+        return weighed.ess < RESAMPLE * count.to(torch.float32)
 
     def shrunk(
         self,

@@ -61,7 +61,7 @@ def tempered(
     for stage in range(_STAGES):
         share = left
         if stage < _STAGES - 1:
-            some = increment(log_weights, gain, left, RESAMPLE * count)
+            some = increment(log_weights, gain, left, RESAMPLE * count.to(torch.float32))
             share = torch.where(staged, some, left)
         used = normalized(log_weights + share.unsqueeze(-1) * gain)
         log_weights = torch.where((left > 0).unsqueeze(-1), used, log_weights)

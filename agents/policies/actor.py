@@ -32,7 +32,7 @@ class Normalizer(nn.Module):
     def fit(self, samples: Float32[Tensor, "n F"]) -> None:
         """Median and half the distance from the 16th to the 84th percentile of each input: what is
         usual, whatever the first steps of an episode are like."""
-        low, middle, high = samples.quantile(torch.tensor((0.16, 0.5, 0.84)), 0)
+        low, middle, high = samples.quantile(samples.new_tensor((0.16, 0.5, 0.84)), 0)
         self.shift.copy_(middle)
         self.scale.copy_((0.5 * (high - low)).clamp_min(1e-3))
 
@@ -66,7 +66,7 @@ class Head(nn.Module):
         with torch.no_grad():
             self.layer.weight.mul_(_SMALL)
             self.layer.bias.zero_()
-            self.layer.bias[outputs:] = torch.tensor(_STD[0]).log()
+            self.layer.bias[outputs:] = torch.tensor(_STD[0], dtype=torch.float32).log()
 
     def forward(
         self, x: Float32[Tensor, "*s H"]

@@ -38,11 +38,12 @@ def check_part(localizer: Localizer, count: int) -> None:
 class ParallelPolicy:
     """A localizer that acts in a PettingZoo parallel environment.
 
-    Call ``reset()`` before every episode, then in each step
-    ``actions = policy({a: observations[a] for a in env.agents})``. ``agents`` names the UAVs that
-    this localizer estimates for (default: all that are there at the first call), so that a team can
-    be a mixture: one policy a kind, their dictionaries merged. A UAV that has failed keeps its row,
-    silent and without measurements, and gets no action.
+    In each step ``actions = policy({a: observations[a] for a in env.agents})``; call ``reset()``
+    before every episode. (A new episode is noticed without: another prior or map, or no message
+    where a link would have brought one. The same world again, with nobody linked, is not.)
+    ``agents`` names the UAVs that this localizer estimates for (default: all that are there at the
+    first call), so that a team can be a mixture: one policy a kind, their dictionaries merged. A
+    UAV that has failed keeps its row, silent and without measurements, and gets no action.
     """
 
     def __init__(self, localizer: Localizer, agents: Sequence[str] | None = None) -> None:
@@ -56,32 +57,73 @@ class ParallelPolicy:
     def reset(self) -> None:
         """Forget the episode."""
         self._belief: Any = None
+        self._steps = 0
         self._rows: dict[str, Mapping[str, np.ndarray]] = {}
 
     @torch.no_grad()
     def __call__(
         self, observations: Mapping[str, Mapping[str, np.ndarray]]
     ) -> dict[str, np.ndarray]:
-        """Actions ``[position (m), velocity (m/s), log-std]`` of the observed agents."""
-        begins = self._belief is None
-        team = (self.agents or tuple(observations)) if begins else tuple(self._rows)
+        """Actions ``[position (m), velocity (m/s), log-std]`` of the observed agents.
+
+        Raises ValueError for what is not the team's observations, such as those of one agent at a
+        time in PettingZoo's agent-environment cycle.
+        """
+        self._require_team(observations)
+        if self._restarted(observations):
+            self.reset()
+        first = not self._steps
+        team = (self.agents or tuple(observations)) if first else tuple(self._rows)
         present = [agent for agent in team if agent in observations]
-        if begins and len(present) < len(team):
-            missing = next(agent for agent in team if agent not in observations)
-            raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
-        if begins:
+        if first:
+            if len(present) < len(team):
+                missing = next(agent for agent in team if agent not in observations)
+                raise ValueError(f"{self.localizer.name}: the episode's first step lacks {missing}")
             check_part(self.localizer, len(team))
         if not present:
             return {}
         for agent in team:
-            seen = observations.get(agent)
-            self._rows[agent] = self._silent(self._rows[agent]) if seen is None else seen
+            own = observations.get(agent)
+            self._rows[agent] = self._silent(self._rows[agent]) if own is None else _copy(own)
         observation = stack(self._rows.values())
-        if begins:
+        if first:
             self._belief = self.localizer.reset(observation)
         self._belief, estimate = self.localizer.step(self._belief, observation)
+        self._steps += 1
         actions = dict(zip(team, estimate.action()[0].numpy(), strict=True))
         return {agent: actions[agent] for agent in present}
+
+    def _require_team(self, observations: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+        """Raise ValueError unless these are observations by agent, of the agents known."""
+        name = self.localizer.name
+        if not all(isinstance(own, Mapping) for own in observations.values()):
+            raise ValueError(
+                f"{name}: {{agent: observation}} of all its UAVs is needed, as the parallel "
+                "environment gives it; an AEC environment's last() is of one agent"
+            )
+        known = self.agents or tuple(self._rows)
+        strange = [agent for agent in observations if agent not in known]
+        if known and self.agents is None and strange:
+            raise ValueError(
+                f"{name}: {strange[0]} was not there at the episode's first step, which had "
+                f"{', '.join(known)}; observations of the whole team are needed at once, not one "
+                "agent's at a time as in an AEC environment"
+            )
+
+    def _restarted(self, observations: Mapping[str, Mapping[str, np.ndarray]]) -> bool:
+        """Whether observations are of another episode than those before."""
+        if not self._steps:
+            return False
+        late = self._steps > self.localizer.believed.message_delay
+        for agent, before in self._rows.items():
+            own = observations.get(agent)
+            if own is None:
+                continue
+            if any(not np.array_equal(own[name], before[name]) for name in self._constant):
+                return True
+            if late and own["links"].any() and not own["message_mask"].any():
+                return True
+        return False
 
     def _silent(self, row: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """What a failed UAV observes: its maps and prior; no measurement, link or message."""
@@ -91,10 +133,14 @@ class ParallelPolicy:
         }
 
 
+def _copy(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: np.array(leaf) for name, leaf in leaves.items()}
+
+
 class LocalizerPolicy(TensorDictModuleBase):
     """A localizer as a TorchRL policy: ``("uav", "observation", leaf)`` → ``("uav", "action")``.
 
-    Rows start anew where ``is_init`` says so, which ``InitTracker`` writes. The belief stays in the
+    Rows restart where ``is_init`` is set, which ``InitTracker`` writes. The belief stays in the
     module, which is then good for one environment at a time, or, with ``carry="tensordict"``, rides
     in the tensordict under ``belief`` (whose transform is ``make_tensordict_primer()``); then the
     module has no state. ``Collector(…, auto_register_policy_transforms=True)`` adds both transforms
@@ -129,8 +175,8 @@ class LocalizerPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        begins = tensordict.get("is_init", None)
-        if begins is None:
+        restarts = tensordict.get("is_init", None)
+        if restarts is None:
             raise KeyError(
                 "LocalizerPolicy needs 'is_init': wrap the environment in "
                 "TransformedEnv(env, InitTracker())"
@@ -140,7 +186,7 @@ class LocalizerPolicy(TensorDictModuleBase):
         belief = self._belief
         if self.carry == "tensordict":
             belief = restored(self._template, tensordict["belief"], observation.batch_size)
-        belief = self._start(belief, observation, begins.flatten())
+        belief = self._start(belief, observation, restarts.flatten())
         after, estimate = self.localizer.step(belief, observation)
         tensordict["uav", "action"] = estimate.action()
         if self.record is not None:

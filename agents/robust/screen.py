@@ -71,7 +71,9 @@ class Screen(ABC):
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         """What it remembers before the first step: nothing."""
-        return torch.zeros(*observation.batch_size, 0, device=observation.device)
+        return torch.zeros(
+            *observation.batch_size, 0, dtype=torch.float32, device=observation.device
+        )
 
     @abstractmethod
     def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Any:

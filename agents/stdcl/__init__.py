@@ -1,6 +1,9 @@
-"""The spatio-temporal graph network of ST-DCL (paper, section 4.2), between optimizer and estimate.
+"""The spatio-temporal graph network of ST-DCL (paper, section 4.2), which corrects the optimizer.
 
-Scalars that mean the same for any swarm gate *vectors* in metres: residuals of links along those
-links, innovations, what neighbours move by. So corrections turn and mirror with the swarm, do not
-notice shifts, and a swarm of another size or scale asks for nothing new.
+Dimensionless scalars gate *vectors* in metres: residuals along links, innovations, displacements of
+neighbours. So corrections are equivariant to rotations and reflections, invariant to translations,
+and transfer to teams of other sizes and scales.
+
+The paper's displayed equations are lost in the text that we have. It names 28 (attention) and 36
+(feedback); the numbers between are counted by the order of the text.
 """

@@ -1,7 +1,7 @@
-"""What the graph network sees of a step: scalars, vectors in metres, and links.
+"""Inputs of the ST-GNN (equation 27): scalars and vectors of nodes, scalars of links.
 
-All scalars are free of units: lengths are counted in standard deviations of a range or of the UAV's
-own position. Sums over links are weighted means, so that teams of any size look alike.
+All scalars are dimensionless: lengths are in standard deviations of a range or of the UAV's own
+position. Sums over links are weighted means, so that networks transfer to teams of other sizes.
 """
 
 from dataclasses import dataclass, fields
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.swarm.belief import Found, Prepared
+from agents.swarm.belief import Solution, StepInput
 from agents.swarm.links import along_links, lengths, own_information
 
 SCALARS = (
@@ -33,9 +33,9 @@ _LINK_TIME = 8.0  # steps over which a link's residual is averaged
 _TIMES = (10.0, 40.0)  # steps over which innovations are averaged
 
 
-class Memory(TensorClass):
-    """Per UAV: each link's running mean ``residual`` (m) and how often it was ``seen``, running
-    means of the ``innovations`` (m), and the steps taken; batch (B, N)."""
+class RunningMeans(TensorClass):
+    """Per UAV: each link's running mean ``residual`` (m) and count of ranges (``seen``), running
+    means of the ``innovations`` over two times (m), and the steps taken; batch (B, N)."""
 
     residual: Float64[Tensor, "B N N"]
     seen: Float64[Tensor, "B N N"]
@@ -44,34 +44,37 @@ class Memory(TensorClass):
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, ``link`` scalars, which are
-    there (``mask``), who ``moves``, and what carries a displacement along links: unit vectors by
-    ``position`` (m, centred) and ``length``, ``weight`` (1/m²), and ``gain`` H⁻¹ (m²) of links and
-    of the ``trust`` (1/m²) in dead reckoning."""
+class GraphInputs:
+    """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, scalars of each ``link`` and
+    which links exist (``mask``), which nodes are ``free``; of displacements through ranges: the
+    ``position`` (m, centred) and ``length`` (m) of links, their ``weight`` W_ij (1/m²), and
+    ``gain`` H_i⁻¹ (m²), H_i = Σ_j W_ij u uᵀ + λ I with the prior's ``precision`` λ (1/m²); and the
+    ``max_offset`` δ_max of corrections (m)."""
 
     scalars: Float64[Tensor, "B N F"]
     vectors: Float64[Tensor, "B N d C"]
     link: Float64[Tensor, "B N N L"]
     mask: Bool[Tensor, "B N N"]
-    moves: Bool[Tensor, "B N"]
+    free: Bool[Tensor, "B N"]
     position: Float64[Tensor, "B N d"]
     length: Float64[Tensor, "B N N"]
     weight: Float64[Tensor, "B N N"]
     gain: Float64[Tensor, "B N d d"]
-    trust: Float64[Tensor, "B N"]
-    reach: Float64[Tensor, "B N"]
+    precision: Float64[Tensor, "B N"]
+    max_offset: Float64[Tensor, "B N"]
 
-    def to(self, like: Tensor) -> "Scene":
+    def to(self, like: Tensor) -> "GraphInputs":
         """The same in another precision."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Scene(**{k: x if x.dtype == torch.bool else x.to(like) for k, x in parts.items()})
+        return GraphInputs(
+            **{k: x if x.dtype == torch.bool else x.to(like) for k, x in parts.items()}
+        )
 
 
-def forgotten(worlds: int, n: int, dim: int, device: torch.device) -> Memory:
-    """The memory of teams that have seen nothing."""
+def initial_means(worlds: int, n: int, dim: int, device: torch.device) -> RunningMeans:
+    """The running means before the first step."""
     zeros = torch.zeros(worlds, n, n, dtype=torch.float64, device=device)
-    return Memory(
+    return RunningMeans(
         residual=zeros,
         seen=zeros.clone(),
         innovations=zeros.new_zeros(worlds, n, dim, len(_TIMES)),
@@ -80,86 +83,100 @@ def forgotten(worlds: int, n: int, dim: int, device: torch.device) -> Memory:
     )
 
 
-def look(
-    now: Prepared,
-    found: Found,
+def graph_inputs(
+    inputs: StepInput,
+    solution: Solution,
     weight: Float64[Tensor, "B N N"],
     shift: Float64[Tensor, "B N N"],
     std: float,
-    memory: Memory,
-    reach: Float64[Tensor, "B N"],
-) -> tuple[Scene, Memory]:
-    """The scene of a step whose optimizer has ``found`` positions with those weights (1/m²) and
-    shifts (m), with corrections up to ``reach`` (m), and the memory after it."""
-    mask, d = now.links.mask, found.position.shape[-1]
-    y = found.position - found.position.mean(1, keepdim=True)
+    means: RunningMeans,
+    max_offset: Float64[Tensor, "B N"],
+) -> tuple[GraphInputs, RunningMeans]:
+    """The network's inputs for a step and its solution with those weights (1/m²) and shifts (m),
+    and the running means after it."""
+    mask, d = inputs.links.mask, solution.position.shape[-1]
+    y = solution.position - solution.position.mean(1, keepdim=True)
     length = lengths(y)
-    residual = (now.links.distance - length) * mask
-    innovation = torch.where(now.fixed.unsqueeze(-1), 0.0, now.place - found.position)
-    memory = _remembered(memory, residual, mask, innovation)
-    vague = _vagueness(now, weight, d).unsqueeze(-2)
-    certain, trust = weight / (1 + weight * vague), 1 / now.variance
+    residual = (inputs.links.distance - length) * mask
+    innovation = torch.where(inputs.fixed.unsqueeze(-1), 0.0, inputs.prior - solution.position)
+    means = _updated(means, residual, mask, innovation)
+    variance = _own_variance(inputs, weight, d).unsqueeze(-2)
+    effective, precision = weight / (1 + weight * variance), 1 / inputs.variance  # W_ij, λ
     eye = torch.eye(d, dtype=y.dtype, device=y.device)
-    told = own_information(y, certain, length) + trust[..., None, None] * eye
-    root = torch.linalg.cholesky_ex(told).L
+    h = own_information(y, effective, length) + precision[..., None, None] * eye  # H_i
+    root = torch.linalg.cholesky_ex(h).L
     gain = torch.cholesky_inverse(root)
     error = (residual / std).clamp(-_CLIP, _CLIP)
-    lasting = (memory.residual / std).clamp(-_CLIP, _CLIP) * mask
-    alike = std * mask / (std**2 + vague)
-    strengths = (
-        certain * (residual - shift),
-        alike * error.clamp(-_SOFT, _SOFT),
-        alike * error * (1 - (error / _TUKEY).square()).clamp_min(0.0).square(),
-        alike * error.clamp_min(0.0),
-        alike * lasting,
+    lasting = (means.residual / std).clamp(-_CLIP, _CLIP) * mask
+    uniform = std * mask.to(torch.float32) / (std**2 + variance)
+    strengths = (  # ψ(e_ij): linear, clipped, Tukey's, positive, averaged over time
+        effective * (residual - shift),
+        uniform * error.clamp(-_SOFT, _SOFT),
+        uniform * error * (1 - (error / _TUKEY).square()).clamp_min(0.0).square(),
+        uniform * error.clamp_min(0.0),
+        uniform * lasting,
     )
-    pulls = along_links(y.unsqueeze(1), torch.stack(strengths, 1), length.unsqueeze(1))
-    newton, *others = pulls.unbind(1)
-    steps = gain @ torch.stack((newton, trust.unsqueeze(-1) * innovation, *others), -1)
-    vectors = torch.cat((steps, innovation.unsqueeze(-1), memory.innovations), -1)
-    vectors = torch.where(now.fixed[..., None, None], 0.0, vectors)
+    gradients = along_links(y.unsqueeze(1), torch.stack(strengths, 1), length.unsqueeze(1))
+    newton, *others = gradients.unbind(1)
+    to_prior = precision.unsqueeze(-1) * innovation
+    steps = gain @ torch.stack((newton, to_prior, *others), -1)  # H_i⁻¹ Σ_j ψ(e_ij) u_ij
+    vectors = torch.cat((steps, innovation.unsqueeze(-1), means.innovations), -1)
+    vectors = torch.where(inputs.fixed[..., None, None], 0.0, vectors)
     confidence = (weight * std**2).clamp_max(1.0)
-    apart = lengths(now.state[..., d : 2 * d]) * mask
-    each = (error, lasting, confidence, torch.log1p(apart / std))
-    scalars = _scalars(now, found, std, memory, told, root, each)
+    relative_speed = lengths(inputs.state[..., d : 2 * d]) * mask
+    each = (error, lasting, confidence, torch.log1p(relative_speed / std))
+    scalars = _scalars(inputs, solution, std, means, h, root, each)
     error, lasting, confidence, speed = each
-    link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(memory.seen) / 3, confidence,
+    link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(means.seen) / 3, confidence,
             speed / 4)  # fmt: skip
-    moves = ~now.fixed
-    seen = (scalars, vectors, torch.stack(link, -1), mask, moves, y, length, certain, gain, trust)
-    return Scene(*seen, reach), memory
+    graph = GraphInputs(
+        scalars=scalars,
+        vectors=vectors,
+        link=torch.stack(link, -1),
+        mask=mask,
+        free=~inputs.fixed,
+        position=y,
+        length=length,
+        weight=effective,
+        gain=gain,
+        precision=precision,
+        max_offset=max_offset,
+    )
+    return graph, means
 
 
-def _vagueness(now: Prepared, weight: Float64[Tensor, "B N N"], dim: int) -> Float64[Tensor, "B N"]:
-    """What each UAV is unsure of (m² per axis), by its own links: it is in the way of those that
-    range to it."""
-    return now.variance / (1 + 0.5 * weight.sum(-1) / dim * now.variance)
+def _own_variance(
+    inputs: StepInput, weight: Float64[Tensor, "B N N"], dim: int
+) -> Float64[Tensor, "B N"]:
+    """Variance of each UAV (m² per axis) after its own links, which it adds to its neighbours'
+    ranges: P⁻¹ ← P⁻¹ + ½ Σ_j W_ij / d."""
+    return inputs.variance / (1 + 0.5 * weight.sum(-1) / dim * inputs.variance)
 
 
 def _scalars(
-    now: Prepared,
-    found: Found,
+    inputs: StepInput,
+    solution: Solution,
     std: float,
-    memory: Memory,
-    told: Float64[Tensor, "B N d d"],
+    means: RunningMeans,
+    h: Float64[Tensor, "B N d d"],
     root: Float64[Tensor, "B N d d"],
     links: tuple[Tensor, ...],
 ) -> Float64[Tensor, "B N F"]:
-    """SCALARS of every UAV; ``told`` is H, ``root`` its Cholesky factor, ``links`` the error, the
-    lasting error, the confidence and the relative speed of each link."""
+    """SCALARS of every UAV; ``root`` is the Cholesky factor of H, ``links`` the error, the mean
+    error, the confidence and the relative speed of each link."""
     error, lasting, confidence, speed = links
-    count = now.links.mask.sum(-1).double()
+    count = inputs.links.mask.sum(-1).double()
 
     def mean(of: Tensor) -> Tensor:
         return of.sum(-1) / count.clamp_min(1.0)
 
-    d = told.shape[-1]
+    d = h.shape[-1]
     volume = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1) / d
-    size = (told.diagonal(dim1=-2, dim2=-1).sum(-1) / d).log()
-    bias, variance = now.model.component(std)
+    size = (h.diagonal(dim1=-2, dim2=-1).sum(-1) / d).log()
+    bias, variance = inputs.error_model.component(std)
     everywhere = torch.stack(
         (
-            now.model.share[:, 1],
+            inputs.error_model.share[:, 1],
             torch.log(variance[:, 0] / std**2),
             bias[:, 1] / std / 4,
             torch.log(variance[:, 1] / std**2) / 4,
@@ -169,14 +186,14 @@ def _scalars(
     own = torch.stack(
         (
             torch.log1p(count) / 4,
-            mean((now.links.mask & now.fixed.unsqueeze(-2)).double()),
-            now.fixed.double(),
+            mean((inputs.links.mask & inputs.fixed.unsqueeze(-2)).double()),
+            inputs.fixed.double(),
             mean(confidence),
-            torch.log(now.variance / std**2) / 4,
-            torch.log(found.variance / std**2) / 4,
-            torch.log(now.added.clamp_min(1e-12) / std**2) / 4,
+            torch.log(inputs.variance / std**2) / 4,
+            torch.log(solution.variance / std**2) / 4,
+            torch.log(inputs.process_noise.clamp_min(1e-12) / std**2) / 4,
             size - volume,
-            -(torch.log(now.variance) + volume) / 4,
+            -(torch.log(inputs.variance) + volume) / 4,
             mean(error),
             mean(error.square()).sqrt(),
             mean((error.abs() > _SOFT).double()),
@@ -187,27 +204,28 @@ def _scalars(
         ),
         -1,
     )
-    age = (1 / (1 + memory.steps)).unsqueeze(-1)
+    age = (1 / (1 + means.steps)).unsqueeze(-1)
     return torch.cat((own, everywhere.unsqueeze(1).expand(-1, own.shape[1], -1), age), -1)
 
 
-def _remembered(
-    memory: Memory,
+def _updated(
+    means: RunningMeans,
     residual: Float64[Tensor, "B N N"],
     mask: Bool[Tensor, "B N N"],
     innovation: Float64[Tensor, "B N d"],
-) -> Memory:
-    """Running means, which begin as plain means; a link that is away is forgotten."""
-    seen = torch.where(mask, memory.seen + 1, memory.seen * (1 - 1 / _LINK_TIME))
+) -> RunningMeans:
+    """The running means after a step: arithmetic at first, then exponential; the mean of a link
+    without ranges loses its weight."""
+    seen = torch.where(mask, means.seen + 1, means.seen * (1 - 1 / _LINK_TIME))
     gain = (1 / seen.clamp_min(1.0)).clamp_min(1 / _LINK_TIME) * mask
-    steps = memory.steps + 1
+    steps = means.steps + 1
     times = innovation.new_tensor(_TIMES)
     share = torch.maximum(1 / steps[..., None, None], 1 / times)
-    means = memory.innovations + share * (innovation.unsqueeze(-1) - memory.innovations)
-    return Memory(
-        residual=memory.residual + gain * (residual - memory.residual),
+    innovations = means.innovations + share * (innovation.unsqueeze(-1) - means.innovations)
+    return RunningMeans(
+        residual=means.residual + gain * (residual - means.residual),
         seen=seen,
-        innovations=means,
+        innovations=innovations,
         steps=steps,
-        batch_size=memory.batch_size,
+        batch_size=means.batch_size,
     )

@@ -1,7 +1,7 @@
-"""Layers of the ST-GNN: topological attention with a gate, dilated causal convolution, fusion.
+"""Layers of the ST-GNN: attention (equation 28), gate (29), dilated causal convolution (30).
 
-Each carries scalars h [B, N, F] and vectors v [B, N, d, C] along. Vectors only ever meet the same
-linear map on every axis and factors made of scalars, so that turning the world turns them.
+Each maps scalars h [B, N, F] and vectors v [B, N, d, C] (m). Vectors are only multiplied by scalars
+and mixed by the same linear map on every axis, so that layers are equivariant to rotations.
 """
 
 import torch
@@ -10,22 +10,22 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from agents.layers import Linear, sigmoid
-from agents.stdcl.features import LINKS, Scene
+from agents.stdcl.features import LINKS, GraphInputs
 from agents.swarm.links import along_links
 
-FAR_APART = 2.0  # times the mean relative speed of a UAV's links
-DOUBTFUL = 0.1  # confidence
+MAX_SPEED = 2.0  # in units of the mean relative speed of a UAV's links
+MIN_CONFIDENCE = 0.1
 _SLOPE = 0.2  # of the leaky rectifier
 _CONFIDENCE, _SPEED = LINKS.index("confidence"), LINKS.index("relative_speed")
 
 
-def bounded(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+def swish(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
     """x σ(1.7 x): smooth, nearly the identity for large x."""
     return x * sigmoid(1.7 * x)
 
 
 class Gate(nn.Module):
-    """Vectors times factors that scalars give, mixed: V' = (V ⊙ g(h)) M, g about 1 at the start."""
+    """Vectors gated by scalars: V' = (V ⊙ g(h)) M, g near 1 initially."""
 
     def __init__(self, width: int, inside: int, outside: int) -> None:
         super().__init__()
@@ -37,54 +37,59 @@ class Gate(nn.Module):
 
 
 class TopologicalAttention(nn.Module):
-    """Equations 26 to 28: α_ij = softmax_j LeakyReLU(aᵀ[W h_i ‖ W h_j ‖ w_v‖Δv_ij‖ ‖ c_ij]), where
-    links between UAVs that fly apart and have little confidence are cut, then
-    h' = z ⊙ h + (1 − z) ⊙ Σ_j α_ij W h_j.
+    """Dynamic topological attention with a gate (ST-DCL paper, section 4.2.1).
 
-    Vectors of neighbours come in two ways: averaged by α, and as far as they act on a UAV through
-    its ranges: H⁻¹ Σ_j W_ij u u ᵀ v_j. ``kinematic=False`` leaves ‖Δv‖, c and the cut out: plain
-    graph attention (Veličković et al., ICLR 2018).
+    Equation 28: α_ij = softmax_j LeakyReLU(aᵀ [W h_i ‖ W h_j ‖ w_v ‖Δv_ij‖ ‖ c_ij]).
+
+    Equation 29: h_i' = z ⊙ h_i + (1 − z) ⊙ Σ_j α_ij W h_j, z = σ(W_z [h_i ‖ Σ_j α_ij W h_j] + b).
+
+    Links with a large relative speed ‖Δv_ij‖ and a low confidence c_ij are cut. Vectors of
+    neighbours are averaged by α, and pushed through ranges, H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j.
+    ``kinematic=False``: without ‖Δv‖, c and the cut, plain graph attention (Veličković et al.,
+    ICLR 2018).
     """
 
-    def __init__(self, width: int, channels: int, carried: int, kinematic: bool = True) -> None:
+    def __init__(self, width: int, channels: int, pushed: int, kinematic: bool = True) -> None:
         super().__init__()
         self.kinematic = kinematic
-        self.map = Linear(width, width)
-        self.ends = Linear(width, 2)
-        self.relative = nn.Parameter(torch.tensor((-0.5, 1.0)))
-        self.keep = Linear(2 * width, width)
-        self.carry = nn.Parameter(torch.randn(channels, carried) / channels**0.5)
-        self.mix = Gate(width, 2 * channels + carried, channels)
+        self.map = Linear(width, width)  # W
+        self.ends = Linear(width, 2)  # a, of h_i and of h_j
+        self.relative = nn.Parameter(torch.tensor((-0.5, 1.0)))  # a, of ‖Δv‖ and of c
+        self.keep = Linear(2 * width, width)  # W_z
+        self.carry = nn.Parameter(torch.randn(channels, pushed) / channels**0.5)
+        self.mix = Gate(width, 2 * channels + pushed, channels)
 
     def forward(
-        self, scene: Scene, h: Float[Tensor, "B N F"], v: Float[Tensor, "B N d C"]
+        self, graph: GraphInputs, h: Float[Tensor, "B N F"], v: Float[Tensor, "B N d C"]
     ) -> tuple[Float[Tensor, "B N F"], Float[Tensor, "B N d C"]]:
         mapped = self.map(h)
-        share = self.attention(scene, mapped)
-        heard = share @ mapped
-        z = sigmoid(self.keep(torch.cat((h, heard), -1)))
-        h = z * h + (1 - z) * bounded(heard)
-        near = (share @ v.flatten(-2)).view_as(v)
-        moved = carried_over(scene, v @ self.carry)
-        v = v + self.mix(h, torch.cat((v, near, moved), -1))
-        return h, torch.where(scene.moves[..., None, None], v, 0.0)
+        alpha = self.attention(graph, mapped)
+        neighbours = alpha @ mapped
+        z = sigmoid(self.keep(torch.cat((h, neighbours), -1)))
+        h = z * h + (1 - z) * swish(neighbours)
+        mean = (alpha @ v.flatten(-2)).view_as(v)
+        pushed = pushed_by_ranges(graph, v @ self.carry)
+        v = v + self.mix(h, torch.cat((v, mean, pushed), -1))
+        return h, torch.where(graph.free[..., None, None], v, 0.0)
 
-    def attention(self, scene: Scene, mapped: Float[Tensor, "B N F"]) -> Float[Tensor, "B N N"]:
-        """α, zero where there is no link, or only doubtful ones between UAVs that fly apart."""
-        here, there = self.ends(mapped).unsqueeze(-2).unbind(-1)
-        logit, mask = here.mT + there, scene.mask
+    def attention(
+        self, graph: GraphInputs, mapped: Float[Tensor, "B N F"]
+    ) -> Float[Tensor, "B N N"]:
+        """α_ij of equation 28 from W h; 0 where there is no link, or a cut one."""
+        own, other = self.ends(mapped).unsqueeze(-2).unbind(-1)
+        logit, mask = own.mT + other, graph.mask
         if self.kinematic:
-            speed, confidence = scene.link[..., _SPEED], scene.link[..., _CONFIDENCE]
+            speed, confidence = graph.link[..., _SPEED], graph.link[..., _CONFIDENCE]
             logit = logit + self.relative[0] * speed + self.relative[1] * confidence
-            usual = speed.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True).clamp_min(1)
-            mask = mask & ~((speed > FAR_APART * usual) & (confidence < DOUBTFUL))
+            mean = speed.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True).clamp_min(1)
+            mask = mask & ~((speed > MAX_SPEED * mean) & (confidence < MIN_CONFIDENCE))
         logit = functional.leaky_relu(logit, _SLOPE).masked_fill(~mask, -1e9)
         return torch.softmax(logit, -1) * mask
 
 
-def carried_over(scene: Scene, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B N d C"]:
-    """H⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j: where neighbours' displacements push a UAV."""
-    y, weight, length, gain = scene.position, scene.weight, scene.length, scene.gain
+def pushed_by_ranges(graph: GraphInputs, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B N d C"]:
+    """H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j: a UAV's displacement by those of its neighbours (m)."""
+    y, weight, length, gain = graph.position, graph.weight, graph.length, graph.gain
     at = v.movedim(-1, 1)  # [B, C, N, d]
     along = (
         y.unsqueeze(1) @ at.mT - (y.unsqueeze(1) * at).sum(-1).unsqueeze(-2)
@@ -94,10 +99,11 @@ def carried_over(scene: Scene, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B 
 
 
 class DilatedConvolution(nn.Module):
-    """Equation 29: y(t) = Σ_k W_k x(t − k·dilation) + b over the past alone, zeros before the
-    start, for scalars and (without b) vectors; with a residual connection.
+    """Dilated causal convolution in time (equation 30): y(t) = Σ_k W_k x(t − k·dilation) + b, zeros
+    before the start, for scalars and (without b) vectors; with a residual connection.
 
-    One step at a time: ``past`` holds the last (kernel − 1)·dilation inputs, newest first.
+    One step at a time: ``past_h`` and ``past_v`` hold the last (kernel − 1)·dilation inputs, newest
+    first.
     """
 
     def __init__(self, width: int, channels: int, kernel: int, dilation: int) -> None:
@@ -116,10 +122,10 @@ class DilatedConvolution(nn.Module):
     ) -> tuple[Float[Tensor, "B N F"], Float[Tensor, "B N d C"]]:
         before_h = [past_h[:, :, k] for k in self.taps]
         before_v = [past_v[:, :, k] for k in self.taps]
-        h = h + bounded(self.scalars(torch.cat((h, *before_h), -1)))
+        h = h + swish(self.scalars(torch.cat((h, *before_h), -1)))
         return h, v + self.mix(h, torch.cat((v, *before_v), -1))
 
 
-def pushed_on(past: Float[Tensor, "B N K *r"], new: Float[Tensor, "B N *r"]) -> Tensor:
+def push(past: Float[Tensor, "B N K *r"], new: Float[Tensor, "B N *r"]) -> Tensor:
     """``past`` with the newest in front and the oldest gone."""
     return torch.cat((new.unsqueeze(2), past[:, :, :-1]), 2)

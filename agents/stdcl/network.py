@@ -8,20 +8,20 @@ from tensordict import TensorClass
 from torch import Tensor, nn
 
 from agents.layers import Linear, sigmoid
-from agents.stdcl.features import LINKS, SCALARS, VECTORS, Scene
-from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, bounded, pushed_on
+from agents.stdcl.features import LINKS, SCALARS, VECTORS, GraphInputs
+from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, push, swish
 from agents.weights import Learned
 
 DILATIONS = (1, 2, 4)
-_CARRIED = 4  # vector channels that neighbours' displacements come in
-_EDGE = 8
-_LEAST = 1e-9  # m
-_WIDEST = 3.0  # of a factor of a standard deviation, as a logarithm
+_PUSHED = 4  # vector channels of neighbours' displacements through ranges
+_EDGE = 8  # hidden units of the links' confidence
+_TINY = 1e-9  # m
+_MAX_LOG_FACTOR = 3.0  # of a variance
 
 
-class Past(TensorClass):
-    """Inputs of the convolutions in the last steps, newest first: scalars and vectors (m) side by
-    side for each layer; batch (B, N)."""
+class ConvolutionState(TensorClass):
+    """Past inputs of the convolutions, newest first: scalars and vectors (m) of all layers, side by
+    side; batch (B, N)."""
 
     scalars: Float[Tensor, "B N K F"]
     vectors: Float[Tensor, "B N K d C"]
@@ -29,19 +29,19 @@ class Past(TensorClass):
 
 @dataclass(frozen=True)
 class Correction:
-    """Shift ``offset`` (m) of each position, the factor ``spread`` of its variance, and what the
-    network wants each link's ``confidence`` to become."""
+    """``offset`` γ Δp (m) of each position, the ``variance_factor`` of its variance, and the
+    ``confidence`` that each link should have."""
 
     offset: Float[Tensor, "B N d"]
-    spread: Float[Tensor, "B N"]
+    variance_factor: Float[Tensor, "B N"]
     confidence: Float[Tensor, "B N N"]
 
 
 class StGnn(Learned):
-    """Equations 25 to 35, with vectors in metres beside the paper's scalars.
+    """Equations 27 to 35, with vectors in metres beside the paper's scalars.
 
-    ``width`` d = 64; ``kernel`` 3 (the paper says 3 in one place, and means 2 in another);
-    ``kinematic=False``: plain graph attention; ``temporal=False``: no convolutions.
+    ``width`` d = 64; ``kernel`` K = 3 (the paper has 3 in one place and a field of K = 2 in
+    another); ``kinematic=False``: plain graph attention; ``temporal=False``: no convolutions.
     """
 
     kind = "stgnn"
@@ -67,13 +67,13 @@ class StGnn(Learned):
         self.width, self.channels = width, channels
         self.encode = nn.ModuleList((Linear(len(SCALARS), width), Linear(width, width)))
         self.hops = nn.ModuleList(
-            TopologicalAttention(width, channels, _CARRIED, kinematic) for _ in range(hops)
+            TopologicalAttention(width, channels, _PUSHED, kinematic) for _ in range(hops)
         )
         self.times = nn.ModuleList(
             DilatedConvolution(width, channels, kernel, dilation)
             for dilation in (DILATIONS if temporal else ())
         )
-        self.scale = Linear(width, 1)  # of eq. 30: which time scale counts
+        self.scale = Linear(width, 1)  # logits of equation 32
         self.out = Linear(width, channels)
         self.trust = nn.Parameter(torch.tensor((1.0, 0.0)))  # w, b of γ = σ(w c + b)
         self.sure = Linear(width, 1)
@@ -89,63 +89,72 @@ class StGnn(Learned):
     def _layers(self) -> list[DilatedConvolution]:
         return [layer for layer in self.times if isinstance(layer, DilatedConvolution)]
 
-    def start(self, shape: torch.Size, dim: int) -> Past:
-        """Zeros: nothing before the first step."""
+    def start(self, shape: torch.Size, dim: int) -> ConvolutionState:
+        """Zeros before the first step (equation 31)."""
         steps = sum(layer.length for layer in self._layers)
         like = self.out.weight
-        return Past(
+        return ConvolutionState(
             scalars=like.new_zeros(*shape, steps, self.width),
             vectors=like.new_zeros(*shape, steps, dim, self.channels),
             batch_size=shape,
         )
 
-    def forward(self, scene: Scene, past: Past) -> tuple[Correction, Past]:
-        scene = scene.to(self.out.weight)
-        h, v = scene.scalars, scene.vectors
-        for layer in self.encode:
-            h = bounded(layer(h))
-        for hop in self.hops:
-            h, v = hop(scene, h, v)
-        h, v, past = self._in_time(h, v, past)
+    def forward(
+        self, graph: GraphInputs, past: ConvolutionState
+    ) -> tuple[Correction, ConvolutionState]:
+        graph = graph.to(self.out.weight)
+        h, v = graph.scalars, graph.vectors
+        for layer in self.encode:  # equation 27
+            h = swish(layer(h))
+        for hop in self.hops:  # equations 28 and 29
+            h, v = hop(graph, h, v)
+        h, v, past = self._convolve(h, v, past)
         raw = (v * self.out(h).unsqueeze(-2)).sum(-1)
-        most = scene.reach.clamp_min(_LEAST).unsqueeze(-1)
-        size = raw.norm(dim=-1, keepdim=True).clamp_min(_LEAST)
-        trust = self._gamma(scene).unsqueeze(-1)
-        offset = trust * most * torch.tanh(size / most) * (raw / size)
-        spread = torch.exp(_WIDEST * torch.tanh(self.sure(h)[..., 0] / _WIDEST))
-        return Correction(offset, spread, self._confidence(scene, h)), past
+        size = raw.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+        limit = graph.max_offset.clamp_min(_TINY).unsqueeze(-1)
+        gamma = self._gamma(graph).unsqueeze(-1)
+        offset = gamma * limit * torch.tanh(size / limit) * (raw / size)  # γ δ_max tanh(·), eq. 34
+        factor = torch.exp(_MAX_LOG_FACTOR * torch.tanh(self.sure(h)[..., 0] / _MAX_LOG_FACTOR))
+        return Correction(offset, factor, self._confidence(graph, h)), past
 
-    def _gamma(self, scene: Scene) -> Tensor:
-        """γ = σ(w c + b) with the mean confidence of a UAV's links (eq. 34)."""
-        c = scene.scalars[..., SCALARS.index("confidence")]
+    def _gamma(self, graph: GraphInputs) -> Float[Tensor, "B N"]:
+        """γ = σ(w c + b), c the mean confidence of a UAV's links (equation 35)."""
+        c = graph.scalars[..., SCALARS.index("confidence")]
         return sigmoid(self.trust[0] * c + self.trust[1])
 
-    def _in_time(self, h: Tensor, v: Tensor, past: Past) -> tuple[Tensor, Tensor, Past]:
-        """Dilated convolutions and their fusion by softmax (eqs. 29 to 31)."""
+    def _convolve(
+        self, h: Tensor, v: Tensor, past: ConvolutionState
+    ) -> tuple[Tensor, Tensor, ConvolutionState]:
+        """Dilated causal convolutions (equation 30) and their fusion Σ_m β_m h^(m),
+        β = softmax(scale(h^(m))) (equations 32 and 33)."""
         if not self.times:
             return h, v, past
         begin, scalars, vectors = 0, [], []
-        found_h, found_v = [], []
+        outputs_h, outputs_v = [], []
         for layer in self._layers:
             steps = slice(begin, begin + layer.length)
             begin = steps.stop
             before_h, before_v = past.scalars[:, :, steps], past.vectors[:, :, steps]
-            scalars.append(pushed_on(before_h, h))
-            vectors.append(pushed_on(before_v, v))
+            scalars.append(push(before_h, h))
+            vectors.append(push(before_v, v))
             h, v = layer(h, v, before_h, before_v)
-            found_h.append(h)
-            found_v.append(v)
-        each_h, each_v = torch.stack(found_h, -1), torch.stack(found_v, -1)
-        share = torch.softmax(torch.cat([self.scale(h) for h in found_h], -1), -1)
-        h = (each_h * share.unsqueeze(-2)).sum(-1)
-        v = (each_v * share[..., None, None, :]).sum(-1)
+            outputs_h.append(h)
+            outputs_v.append(v)
+        each_h, each_v = torch.stack(outputs_h, -1), torch.stack(outputs_v, -1)
+        beta = torch.softmax(torch.cat([self.scale(h) for h in outputs_h], -1), -1)
+        h = (each_h * beta.unsqueeze(-2)).sum(-1)
+        v = (each_v * beta[..., None, None, :]).sum(-1)
         after = (torch.cat(scalars, 2), torch.cat(vectors, 2))
-        return h, v, Past(scalars=after[0], vectors=after[1], batch_size=past.batch_size)
+        return (
+            h,
+            v,
+            ConvolutionState(scalars=after[0], vectors=after[1], batch_size=past.batch_size),
+        )
 
-    def _confidence(self, scene: Scene, h: Tensor) -> Float[Tensor, "B N N"]:
-        """What either end says of a link, alike from both."""
+    def _confidence(self, graph: GraphInputs, h: Tensor) -> Float[Tensor, "B N N"]:
+        """The confidence of each link, symmetric in its ends."""
         n = h.shape[1]
-        ends, seen = self.edge_nodes(h), self.edge(scene.link.flatten(1, 2))
-        inside = torch.tanh(seen.unflatten(1, (n, n)) + ends.unsqueeze(1) + ends.unsqueeze(2))
-        logit: Tensor = self.edge_out(inside.flatten(1, 2))[..., 0]
+        ends, links = self.edge_nodes(h), self.edge(graph.link.flatten(1, 2))
+        hidden = torch.tanh(links.unflatten(1, (n, n)) + ends.unsqueeze(1) + ends.unsqueeze(2))
+        logit: Tensor = self.edge_out(hidden.flatten(1, 2))[..., 0]
         return sigmoid(logit.unflatten(1, (n, n)))

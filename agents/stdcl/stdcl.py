@@ -1,9 +1,10 @@
 """ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, sections 4 and 4.2.3)."""
 
-from agents.stdcl.loop import Feedback, NetworkLoop
+from agents.stdcl.feedback import FeedbackKind
+from agents.stdcl.loop import NetworkLoop
 from agents.stdcl.network import StGnn
+from agents.swarm.confidence import ConfidenceKind
 from agents.swarm.dwmds_st import DynamicMds
-from agents.swarm.filter import Confidence
 from agents.weights import learned
 from coloc_env.scenario import Believed
 
@@ -23,8 +24,8 @@ class StDcl(NetworkLoop):
         believed: Believed,
         *,
         weights: str = "stdcl",
-        feedback: Feedback = "learned",
-        confidence: Confidence = "em",
+        feedback: FeedbackKind = "learned",
+        confidence: ConfidenceKind = "em",
     ) -> None:
         base = DynamicMds(believed, confidence=confidence)
         super().__init__(base, learned(StGnn, weights), feedback)

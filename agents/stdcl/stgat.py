@@ -1,23 +1,23 @@
-"""ST-DCL: the DW-MDS optimizer and the ST-GNN in a closed loop (paper, sections 4 and 4.2.3)."""
+"""``stgat``: plain graph attention without an optimizer, the learned baseline of ST-DCL."""
 
 from jaxtyping import Float64
 from torch import Tensor
 
-from agents.stdcl.loop import REACH, NetworkLoop
+from agents.stdcl.loop import MAX_OFFSET, NetworkLoop
 from agents.stdcl.network import StGnn
-from agents.swarm.belief import Found, Prepared, SwarmBelief
+from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.filter import SwarmFilter
 from agents.weights import learned
 from coloc_env.scenario import Believed
 
 
-class _Reckoned(SwarmFilter):
+class _DeadReckoning(SwarmFilter):
     """Dead reckoning alone, with all links alike."""
 
     name = "stgat"
 
-    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        return Found(now.place, now.variance)
+    def solve(self, belief: SwarmBelief, inputs: StepInput) -> Solution:
+        return Solution(inputs.prior, inputs.variance)
 
 
 class StGat(NetworkLoop):
@@ -28,8 +28,8 @@ class StGat(NetworkLoop):
 
     def __init__(self, believed: Believed, *, weights: str = "stgat") -> None:
         network = learned(StGnn, weights, kinematic=False)
-        super().__init__(_Reckoned(believed, "none"), network, "positions")
+        super().__init__(_DeadReckoning(believed, "none"), network, "positions")
 
-    def _reach(self, now: Prepared, found: Found) -> Float64[Tensor, "B N"]:
-        """Three standard deviations of dead reckoning."""
-        return REACH * now.variance.sqrt()
+    def _max_offset(self, inputs: StepInput, solution: Solution) -> Float64[Tensor, "B N"]:
+        """Three standard deviations of dead reckoning (m)."""
+        return MAX_OFFSET * inputs.variance.sqrt()

@@ -1,4 +1,4 @@
-"""What a holder says: the mean around its best particle, and how well its window determines it."""
+"""A holder's estimate: the mean around its best particle, and its covariance by the window."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from agents.stein.likelihood import Factors, Scale
-from agents.stein.window import Window, agents_of
+from agents.stein.match_window import MatchWindow, agents_of
 from coloc_env.geometry import Poses
 
 
@@ -38,19 +38,19 @@ def map_estimate(
 def covariance(
     poses: type[Poses],
     estimate: Float64[Tensor, "B H N P"],
-    window: Window,
+    window: MatchWindow,
     inliers: Float64[Tensor, "B H W"],
     known: Factors,
     scale: Scale,
     prior: Float64[Tensor, "D"],
 ) -> Float64[Tensor, "B N D D"]:
-    """Each holder's covariance of its own pose, in its tangent: inverse of the Gauss–Newton
-    information of its window about the estimate. ``prior``: variances of a uniform pose. UAV 0 is
-    known. What odometry has added since is common to all matches: on average it adds up in full."""
+    """Each holder's covariance of its own pose, in its tangent: the inverse of the Gauss–Newton
+    information Jᵀ W J + Λ of its window about the estimate. ``prior``: variances of a uniform pose.
+    UAV 0 is known. The variance of odometry since is common to all matches and is added in full."""
     n, d = estimate.shape[2], poses.dof
     at_first, at_second = known.at_first.mT, known.at_second.mT
-    here, there = (agents_of(estimate, index) for index in (window.first, window.second))
-    back = poses.adjoint(poses.between(there, here))  # [B, H, W, D, D]
+    first, second = (agents_of(estimate, index) for index in (window.first, window.second))
+    back = poses.adjoint(poses.between(second, first))  # [B, H, W, D, D]
     eye = torch.eye(d, dtype=estimate.dtype, device=estimate.device)
     jacobian = (
         at_second[..., None, :, None] * eye.unsqueeze(-2)
@@ -58,17 +58,17 @@ def covariance(
     ).flatten(-2)  # [B, H, W, D, N·D]
     turns = d - poses.dim
     std = torch.stack((scale.position,) * poses.dim + (scale.turn,) * turns, -1).unsqueeze(2)
-    grown = known.variance.sqrt()
-    grown = torch.cat((grown[..., :1],) * poses.dim + (grown[..., 1:],) * turns, -1)
-    weight = inliers.sqrt().unsqueeze(-1) / (std * grown)
+    factor = known.variance.sqrt()
+    factor = torch.cat((factor[..., :1],) * poses.dim + (factor[..., 1:],) * turns, -1)
+    weight = inliers.sqrt().unsqueeze(-1) / (std * factor)
     rows = (weight.unsqueeze(-1) * jacobian).flatten(2, 3)
-    before = (1 / prior).repeat(n)
-    before[:d] = before[:d] * 1e12
-    joint = torch.linalg.inv(rows.mT @ rows + torch.diag(before))
+    precision = (1 / prior).repeat(n)
+    precision[:d] = precision[:d] * 1e12
+    joint = torch.linalg.inv(rows.mT @ rows + torch.diag(precision))
     own = torch.arange(n, device=estimate.device)
     blocks = joint.unflatten(-1, (n, d)).unflatten(2, (n, d))[:, own, own, :, own].movedim(0, 1)
     share = (inliers / inliers.sum(-1, keepdim=True).clamp_min(1e-9)).unsqueeze(-1)
-    drift = (share * window.grown).sum(2)
+    drift = (share * window.added_variance).sum(2)
     return blocks + torch.diag_embed(
         torch.cat((drift[..., :1],) * poses.dim + (drift[..., 1:],) * turns, -1)
     )

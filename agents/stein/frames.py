@@ -1,4 +1,4 @@
-"""Poses as matrices: what is done with one pose and many others is then a single product."""
+"""Poses as matrices, so that one pose acts on many others by a single product."""
 
 import torch
 from jaxtyping import Float64
@@ -7,7 +7,7 @@ from torch import Tensor
 from coloc_env.geometry import Poses, cross_matrix, join, rotation_matrix
 
 
-def seen_from(
+def inverse_action(
     poses: type[Poses], x: Float64[Tensor, "*s P"]
 ) -> tuple[Float64[Tensor, "*s d d"], Float64[Tensor, "*s P P"], Float64[Tensor, "*s P"]]:
     """Rotation R, and A, b with ``x⁻¹ y = A y + b`` of the numbers stored for any pose y; in the

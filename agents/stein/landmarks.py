@@ -1,4 +1,4 @@
-"""How well a UAV's states fit the landmarks seen, some of which are mistaken for others."""
+"""Likelihood of landmark sightings with mistaken identities, and its Gauss–Newton terms."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from agents.models.measurements import Block
 
 
 @dataclass(frozen=True)
-class Sighted:
+class LandmarkFit:
     """``information`` Σ (ω/s²) JᵀJ and ``gradient`` Σ (ω/s²) Jᵀr by the error of the pose,
     ``log_density`` up to a constant, ``inliers``: each landmark's responsibility ω."""
 
@@ -21,14 +21,14 @@ class Sighted:
     inliers: Float64[Tensor, "*s L"]
 
 
-def sighted(
+def fit_landmarks(
     block: Block,
     variance: Float64[Tensor, "*s L"],
     share: float,
     volume: float,
-) -> Sighted:
+) -> LandmarkFit:
     """A mixture of Gaussian sightings, of ``variance`` s² an axis, and mistaken ones, a ``share``
-    of all, uniform over ``volume`` (m³): ω = e^{−e²/2}/(e^{−e²/2} + β), e² = |r|²/s²,
+    ε of all, uniform over the ``volume`` V (m³): ω = e^{−e²/2}/(e^{−e²/2} + β), e² = |r|²/s²,
     β = ε/(1 − ε) (2π)^{d/2} s^d/V."""
     residual = torch.where(block.mask.unsqueeze(-1), block.residual, 0.0)
     d = residual.shape[-1]
@@ -38,7 +38,7 @@ def sighted(
     inliers = torch.where(block.mask, gauss / (gauss + beta), 0.0)
     weighted = (inliers / variance)[..., None, None] * block.jacobian
     rows, weighted = block.jacobian.flatten(-3, -2), weighted.flatten(-3, -2)
-    return Sighted(
+    return LandmarkFit(
         information=weighted.mT @ rows,
         gradient=(weighted.mT @ residual.flatten(-2).unsqueeze(-1))[..., 0],
         log_density=torch.where(block.mask, (gauss + beta).log(), 0.0).sum(-1),

@@ -1,4 +1,4 @@
-"""How well poses fit the matches remembered, and where Gauss–Newton would move them."""
+"""Likelihood of the matches in the window, and its Gauss–Newton steps (equation 17)."""
 
 import math
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from agents.stein.frames import adjoint, seen_from
-from agents.stein.window import Window, agents_of
+from agents.stein.frames import adjoint, inverse_action
+from agents.stein.match_window import MatchWindow, agents_of
 from coloc_env.geometry import Poses
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Standard deviations that matches count with at present: m and rad, [B, H]."""
+    """Annealed standard deviations of matches: ``position`` s_p (m), ``turn`` s_r (rad)."""
 
     position: Float64[Tensor, "B H"]
     turn: Float64[Tensor, "B H"]
@@ -34,21 +34,21 @@ class Fit:
 
 @dataclass(frozen=True)
 class Factors:
-    """The window as factors, prepared once a step, so that iterations are products of matrices.
+    """The window as factors, computed once a step, so that iterations are products of matrices.
 
-    Who is at their ends (0 or 1), variances over those of the scale (of position and turn),
-    ``seen`` and ``offset``: y ↦ T⁻¹ y of the numbers stored for a pose, ``gather``: from factors'
-    residuals to the sum of their steps at each agent, ``weigh``: from their responsibilities to the
-    sum of weights.
+    ``at_first``, ``at_second``: incidence of agents (0 or 1); ``variance`` v in units of the
+    scale's (of position and turn); ``inverse`` and ``offset``: y ↦ T⁻¹ y of the numbers of a pose;
+    ``to_steps``: from residuals to the sums of steps at each agent; ``to_weights``: from
+    responsibilities to the sums of weights.
     """
 
     at_first: Float64[Tensor, "B H N W"]
     at_second: Float64[Tensor, "B H N W"]
     variance: Float64[Tensor, "B H W 2"]
-    seen: Float64[Tensor, "B H W P P"]
+    inverse: Float64[Tensor, "B H W P P"]
     offset: Float64[Tensor, "B H W P"]
-    gather: Float64[Tensor, "B H N*D W*D"]
-    weigh: Float64[Tensor, "B H N*2 W"]
+    to_steps: Float64[Tensor, "B H N*D W*D"]
+    to_weights: Float64[Tensor, "B H N*2 W"]
 
 
 def outlier_level(
@@ -61,14 +61,14 @@ def outlier_level(
     return share / (1 - share) * peak / volume
 
 
-def factors(poses: type[Poses], window: Window, scale: Scale, agents: int) -> Factors:
-    """Who is where, and how much each end's step counts.
+def factors(poses: type[Poses], window: MatchWindow, scale: Scale, agents: int) -> Factors:
+    """The factors of the window, and the weight of each end's step.
 
-    The second end's step says where it is in the first one's frame; the first end's says where
-    it must stand to see the second there, and is by |t| times the turn's error worse.
+    The second end's step is in the first one's frame; the first end's has the rotation's error
+    times |t| in addition.
     """
     one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2)
-    variance = 1 + window.grown / one
+    variance = 1 + window.added_variance / one
     position, turn = variance.unbind(-1)
     lever = poses.split(window.pose)[0].square().sum(-1) * one[..., 1] / one[..., 0]
     index = torch.arange(agents, device=position.device).unsqueeze(-1)
@@ -77,19 +77,19 @@ def factors(poses: type[Poses], window: Window, scale: Scale, agents: int) -> Fa
     first = torch.stack((1 / (position + lever * turn), 1 / turn), -2)
     first = at_first.unsqueeze(3) * first.unsqueeze(2)  # [B, H, N, 2, W]
     second = at_second.unsqueeze(3) / variance.mT.unsqueeze(2)
-    rotation, seen, offset = seen_from(poses, window.pose)
+    rotation, inverse, offset = inverse_action(poses, window.pose)
     return Factors(
         at_first=at_first,
         at_second=at_second,
         variance=variance,
-        seen=seen,
+        inverse=inverse,
         offset=offset,
-        gather=_gather(window.pose, rotation, first, second),
-        weigh=(first + second).flatten(2, 3),
+        to_steps=_to_steps(window.pose, rotation, first, second),
+        to_weights=(first + second).flatten(2, 3),
     )
 
 
-def _gather(
+def _to_steps(
     pose: Float64[Tensor, "B H W P"],
     rotation: Float64[Tensor, "B H W d d"],
     first: Float64[Tensor, "B H N 2 W"],
@@ -104,10 +104,10 @@ def _gather(
     return (first * back.transpose(2, 3).unsqueeze(2) - second * eye).flatten(4).flatten(2, 3)
 
 
-def compare(
+def residuals(
     poses: type[Poses],
     x: Float64[Tensor, "B H N m P"],
-    window: Window,
+    window: MatchWindow,
     known: Factors,
     scale: Scale,
     beta: Float64[Tensor, "B H"],
@@ -117,33 +117,33 @@ def compare(
     and the log-density up to a constant."""
     d = poses.dim
     between = poses.between(agents_of(x, window.first), agents_of(x, window.second))
-    there = known.seen @ between.mT + known.offset.unsqueeze(-1)
+    there = known.inverse @ between.mT + known.offset.unsqueeze(-1)
     residual = poses.log(there.mT)
     squares = residual.square()
     one = torch.stack((scale.position, scale.turn), -1).square().unsqueeze(2) * known.variance
     distance = squares[..., :d].sum(-1) / one[..., :1] + squares[..., d:].sum(-1) / one[..., 1:]
     gauss = torch.exp(-0.5 * distance)
     mixed = gauss + beta[..., None, None]
-    held = window.held.unsqueeze(-1)
-    inliers = torch.where(held, gauss / mixed, 0.0)
-    return residual, inliers, torch.where(held, mixed.log(), 0.0).sum(-2)
+    mask = window.mask.unsqueeze(-1)
+    inliers = torch.where(mask, gauss / mixed, 0.0)
+    return residual, inliers, torch.where(mask, mixed.log(), 0.0).sum(-2)
 
 
 def fit(
     poses: type[Poses],
     x: Float64[Tensor, "B H N m P"],
-    window: Window,
+    window: MatchWindow,
     known: Factors,
     scale: Scale,
     beta: Float64[Tensor, "B H"],
 ) -> Fit:
-    """Where matches would move their ends.
+    """Gauss–Newton steps of the matches at their ends.
 
     Because J_r(r) r = r, the Gauss–Newton step of one factor needs no solve: it is −r at x_j and
     Ad(T) r at x_i (eq. 17).
     """
-    residual, inliers, log_density = compare(poses, x, window, known, scale, beta)
+    residual, inliers, log_density = residuals(poses, x, window, known, scale, beta)
     weighted = (inliers.unsqueeze(-1) * residual).mT.flatten(2, 3)
-    steps = (known.gather @ weighted).unflatten(2, (-1, poses.dof)).mT
-    weight = (known.weigh @ inliers).unflatten(2, (-1, 2)).mT
+    steps = (known.to_steps @ weighted).unflatten(2, (-1, poses.dof)).mT
+    weight = (known.to_weights @ inliers).unflatten(2, (-1, 2)).mT
     return Fit(steps, weight, log_density, inliers)

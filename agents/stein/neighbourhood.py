@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.stein.likelihood import Fit, Scale
-from agents.stein.window import Window
+from agents.stein.match_window import MatchWindow
 from coloc_env.geometry import Poses, pair_distances
 
 _NEAREST = 5  # particles that make up a neighbourhood
@@ -14,15 +14,17 @@ _NEAREST = 5  # particles that make up a neighbourhood
 def fit_neighbours(
     poses: type[Poses],
     x: Float64[Tensor, "B H N m P"],
-    window: Window,
+    window: MatchWindow,
     scale: Scale,
     beta: Float64[Tensor, "B H"],
     talking: Bool[Tensor, "B H R"],
 ) -> Fit:
-    """log P_Q = −Σ_k d_kᵀ Σ d_k, d_k = log(p_{j,k}⁻¹ (p_{i,r} T)): each holder's particles of its
-    own pose, seen through a match, against the nearest of its partner's particles of its own.
+    """Equation 16: log P_Q = −Σ_k d_kᵀ Σ d_k, d_k = log(p_{j,k}⁻¹ (p_{i,r} T)), each holder's
+    particles of its own pose, transformed by a match, against the nearest of its partner's own
+    particles.
 
-    Nothing ties a holder's entries for other agents to matches. ``beta`` of 0 believes every match.
+    A holder's entries for other agents have no likelihood. With ``beta`` 0 every match is an
+    inlier.
     """
     n, m = x.shape[2:4]
     holder = torch.arange(n, device=x.device)
@@ -30,21 +32,21 @@ def fit_neighbours(
     first = window.first == holder.unsqueeze(-1)
     partner = torch.where(first, window.second, window.first)
     toward = torch.where(first.unsqueeze(-1), window.pose, poses.inverse(window.pose)).unsqueeze(-2)
-    seen = poses.compose(own.unsqueeze(2), toward)  # [B, H, W, m, P]
+    predicted = poses.compose(own.unsqueeze(2), toward)  # [B, H, W, m, P]
     index = partner.flatten(1)[..., None, None].expand(-1, -1, m, poses.size)
     there = own.gather(1, index).unflatten(1, partner.shape[1:])
-    apart, angle = pair_distances(poses, seen, there)
+    squared, angle = pair_distances(poses, predicted, there)
     one = (s.square()[..., None, None, None] for s in (scale.position, scale.turn))
-    distance, nearest = (apart / next(one) + angle / next(one)).topk(
+    distance, nearest = (squared / next(one) + angle / next(one)).topk(
         min(_NEAREST, m), -1, largest=False
     )
     wide = nearest.flatten(-2).unsqueeze(-1).expand(-1, -1, -1, -1, poses.size)
     near = there.gather(3, wide).unflatten(3, nearest.shape[-2:])
-    step = poses.minus(near, seen.unsqueeze(-2)).mean(-2)
+    step = poses.minus(near, predicted.unsqueeze(-2)).mean(-2)
     gauss = torch.exp(-0.5 * distance.mean(-1))
-    held = (window.held & talking.gather(2, partner)).unsqueeze(-1)
+    mask = (window.mask & talking.gather(2, partner)).unsqueeze(-1)
     level = beta[..., None, None]
-    inliers = torch.where(held, torch.where(level > 0, gauss / (gauss + level), 1.0), 0.0)
+    inliers = torch.where(mask, torch.where(level > 0, gauss / (gauss + level), 1.0), 0.0)
     moved = (inliers.unsqueeze(-1) * poses.carry(toward, step)).sum(2)
     weight = inliers.sum(2)
     mine = torch.eye(n, dtype=x.dtype, device=x.device)[..., None]
@@ -52,6 +54,6 @@ def fit_neighbours(
     return Fit(
         steps=mine.unsqueeze(-1) * moved.unsqueeze(2),
         weight=(mine * weight.unsqueeze(2)).unsqueeze(-1).expand(-1, -1, -1, -1, 2),
-        log_density=torch.where(held, density, 0.0).sum(2),
+        log_density=torch.where(mask, density, 0.0).sum(2),
         inliers=inliers,
     )

@@ -1,8 +1,8 @@
 """Single-agent visual-inertial Stein particle filter (CSPF paper, section 6).
 
-Particles on SE(3) × velocity × biases. The pre-integrated IMU (eqs. 28–29) moves them, Stein
-variational gradient descent with Gauss–Newton targets draws them to the posterior: the predicted
-Gaussian times a mixture of right and mistaken landmarks.
+Particles on SE(3) × velocity × biases. They are predicted by the pre-integrated IMU (equations 28
+and 29) and moved by SVGD with Gauss–Newton steps (equations 15 and 17) to the posterior: the
+predicted Gaussian times a mixture of right and mistaken landmarks.
 """
 
 import math
@@ -22,20 +22,21 @@ from agents.models.process import InertialProcess
 from agents.particle.belief import normal, own_keys
 from agents.particle.sampling import from_prior
 from agents.stein.estimate import Manifold, map_estimate
-from agents.stein.landmarks import Sighted, sighted
+from agents.stein.landmarks import LandmarkFit, fit_landmarks
 from agents.stein.likelihood import Scale
 from agents.stein.update import kernel, mean_over, stein_step
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.geometry import Se3, concat, rotate, unrotate
 from coloc_env.observation import Observation
+from coloc_env.options import OpenShare, PositiveCount, PositiveShare, Ratio
 from coloc_env.scenario import Believed, Inertial
 from coloc_env.sensors import Imu, Landmarks
 
 _POSE = (0, 1, 2, 6, 7, 8)  # of the error: position and attitude
 _REST = (3, 4, 5, 9, 10, 11, 12, 13, 14)  # velocity and biases
-_KNOWN = 1e-9  # m/s², rad/s: deviation of a bias that the team believes is not there
-_NOTHING = 1e-16  # added to the variance of increments over no time at all
+_KNOWN = 1e-9  # m/s², rad/s: deviation of a bias that is believed to be zero
+_TINY = 1e-16  # keeps the covariance of increments over no time regular
 
 
 class SteinViBelief(TensorClass):
@@ -54,10 +55,9 @@ class SteinViBelief(TensorClass):
 class SteinViFilter(Localizer[SteinViBelief]):
     """Stein particles of one UAV by IMU and landmarks, each UAV for itself.
 
-    ``particles``, and ``iterations`` a step. At the first iteration a landmark counts with what the
-    prediction's uncertainty adds to its noise, and ``anneal`` times that deviation at each further
-    one. ``pace`` and ``repulsion`` of the Stein step; ``outliers``: share of landmarks believed to
-    be mistaken.
+    ``particles``, and ``iterations`` a step. At the first iteration the prediction's variance is
+    added to that of each landmark, ``anneal`` times its deviation at each further one. ``pace`` and
+    ``repulsion`` of the Stein step; ``outliers``: believed share ε of mistaken landmarks.
     """
 
     name = "stein_vi"
@@ -67,12 +67,12 @@ class SteinViFilter(Localizer[SteinViBelief]):
         self,
         believed: Believed,
         *,
-        particles: int = 20,
-        iterations: int = 3,
-        anneal: float = 0.2,
-        pace: float = 0.8,
-        repulsion: float = 1.0,
-        outliers: float = 0.1,
+        particles: PositiveCount = 20,
+        iterations: PositiveCount = 3,
+        anneal: PositiveShare = 0.2,
+        pace: PositiveShare = 0.8,
+        repulsion: Ratio = 1.0,
+        outliers: OpenShare = 0.1,
         seed: int = 0,
     ) -> None:
         super().__init__(believed)
@@ -80,16 +80,6 @@ class SteinViFilter(Localizer[SteinViBelief]):
         motion = believed.process
         if imu is None or landmarks is None or not isinstance(motion, Inertial):
             raise ValueError("a team with an IMU, landmarks and inertial motion is needed")
-        for key, value in (("particles", particles), ("iterations", iterations)):
-            if value < 1:
-                raise ValueError(f"{key}={value} is not allowed: at least 1")
-        if not 0 < outliers < 1:
-            raise ValueError(f"outliers={outliers} is not allowed: a share in (0, 1)")
-        for key, size in (("anneal", anneal), ("pace", pace)):
-            if not 0 < size <= 1:
-                raise ValueError(f"{key}={size} is not allowed: a factor in (0, 1]")
-        if not repulsion >= 0:
-            raise ValueError(f"repulsion={repulsion} is not allowed: a number ≥ 0")
         known = max(motion.accel_bias, _KNOWN), max(motion.gyro_bias, _KNOWN)
         motion = replace(motion, accel_bias=known[0], gyro_bias=known[1])
         process = self.process = InertialProcess(believed.arena.dt, imu, motion)
@@ -117,16 +107,16 @@ class SteinViFilter(Localizer[SteinViBelief]):
     def step(
         self, belief: SteinViBelief, observation: Observation
     ) -> tuple[SteinViBelief, Estimate]:
-        x, prior, covariance = self._predicted(belief, observation)
+        x, prior, covariance = self._predict(belief, observation)
         leaves = ("landmarks", "landmark_mask", "landmark_map")
-        seen = Observation({name: observation[name].unsqueeze(2) for name in leaves})
+        sightings = Observation({name: observation[name].unsqueeze(2) for name in leaves})
         block = self._block(prior, observation)
         inner = covariance[..., _POSE, :][..., _POSE].unsqueeze(-3)
-        told = (block.jacobian @ inner * block.jacobian).sum((-2, -1)) / 3
+        added = (block.jacobian @ inner * block.jacobian).sum((-2, -1)) / 3  # H P Hᵀ
         for iteration in range(self.iterations):
-            blurred = block.variance[..., 0] + self.anneal ** (2 * iteration) * told
-            x, estimate = self._iterated(x, prior, covariance, blurred, seen)
-        last = self._sighted(self._block(estimate, observation), blurred)
+            variance = block.variance[..., 0] + self.anneal ** (2 * iteration) * added
+            x, estimate = self._iterate(x, prior, covariance, variance, sightings)
+        last = self._fit_landmarks(self._block(estimate, observation), variance)
         posterior = covariance - covariance[..., _POSE] @ _solved(
             last.information, covariance, last.information @ covariance[..., _POSE, :]
         )
@@ -150,11 +140,11 @@ class SteinViFilter(Localizer[SteinViBelief]):
     def diagnostics(self, belief: SteinViBelief) -> dict[str, Tensor]:
         return {"inlier_share": belief.inliers}
 
-    def _predicted(
+    def _predict(
         self, belief: SteinViBelief, observation: Observation
     ) -> tuple[Float64[Tensor, "B N m 16"], Float64[Tensor, "B N 16"], Float64[Tensor, "B N E E"]]:
-        """Particles, estimate and covariance at the observation's step: one window of samples
-        serves all, each particle with its own bias (eq. 44 of Forster et al.) and noise."""
+        """Particles, estimate and covariance at the observation's step: one window of samples for
+        all, each particle with its own bias (equation 44 of Forster et al.) and noise."""
         window = self._window(belief, observation)
         state = belief.state.unsqueeze(2)
         navigation, added = preintegration.transition(state[..., :10], window)
@@ -170,7 +160,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
 
         key = noise.fold(belief.key, belief.step)
         draws = normal(key, "stein_vi.step", 15, self.particles).double()
-        tiny = _NOTHING * torch.eye(9, dtype=added.dtype, device=added.device)
+        tiny = _TINY * torch.eye(9, dtype=added.dtype, device=added.device)
         jitter = (torch.linalg.cholesky_ex(window.covariance + tiny).L @ draws[..., :9, None])[
             ..., 0
         ]
@@ -181,8 +171,8 @@ class SteinViFilter(Localizer[SteinViBelief]):
         return x, prior[:, :, 0], covariance[:, :, 0]
 
     def _window(self, belief: SteinViBelief, observation: Observation) -> Preintegrated:
-        """The step's samples or, where there is but their mean, that (no time at the first step),
-        as one window [B, N, 1] for all particles, the estimate's bias taken off."""
+        """The step's samples, or their mean where there is only that, pre-integrated for all
+        particles [B, N, 1] without the estimate's bias; over no time in the first step."""
         if "imu_samples" in observation:
             held = observation["imu_held"].double()
             samples = observation["imu_samples"].double().unflatten(-1, (-1, 6))
@@ -191,13 +181,18 @@ class SteinViFilter(Localizer[SteinViBelief]):
             held = torch.full_like(samples[..., 0], self.process.dt)
         held = held * (belief.step > 0).unsqueeze(-1)
         whiter = held.shape[-1] ** 0.5  # the mean over a step is less noisy than a sample
-        return preintegration.preintegrate(
+        window = preintegration.preintegrate(
             samples.unsqueeze(2),
             held.unsqueeze(2),
             belief.state[..., 10:].unsqueeze(2),
             whiter * self.imu.accel_std,
             whiter * self.imu.gyro_std,
         )
+        if "imu_unknown" not in observation:
+            return window
+        unknown = observation["imu_unknown"].double().unbind(-1)
+        added = self.process.strapdown_noise(*unknown)[..., :9, :9]
+        return replace(window, covariance=window.covariance + added.unsqueeze(2))
 
     @staticmethod
     def _moved(
@@ -211,16 +206,16 @@ class SteinViFilter(Localizer[SteinViBelief]):
         block = self.model.linearize(self.process, x, observation, nobody(x[..., :3]))
         return replace(block, jacobian=block.jacobian[..., _POSE])
 
-    def _sighted(self, block: Block, variance: Float64[Tensor, "*s L"]) -> Sighted:
-        return sighted(block, variance, self.outliers, self.volume)
+    def _fit_landmarks(self, block: Block, variance: Float64[Tensor, "*s L"]) -> LandmarkFit:
+        return fit_landmarks(block, variance, self.outliers, self.volume)
 
-    def _iterated(
+    def _iterate(
         self,
         x: Float64[Tensor, "B N m 16"],
         prior: Float64[Tensor, "B N 16"],
         covariance: Float64[Tensor, "B N 15 15"],
         variance: Float64[Tensor, "B N L"],
-        seen: Observation,
+        sightings: Observation,
     ) -> tuple[Float64[Tensor, "B N m 16"], Float64[Tensor, "B N 16"]]:
         """One Stein step to N(prior, P) times the landmarks' mixture, and the estimate: the mean of
         the Gauss–Newton targets around the best particle.
@@ -231,15 +226,14 @@ class SteinViFilter(Localizer[SteinViBelief]):
         the prior has them correlated, G = P_rp P_pp⁻¹.
         """
         process = self.process
-        found = self._sighted(self._block(x, seen), variance.unsqueeze(2))
-        apart = process.boxminus(prior.unsqueeze(2).expand_as(x), x).contiguous()
+        found = self._fit_landmarks(self._block(x, sightings), variance.unsqueeze(2))
+        to_prior = process.boxminus(prior.unsqueeze(2).expand_as(x), x).contiguous()
         wide = covariance.unsqueeze(2)
-        lacking = found.gradient - (found.information @ apart[..., _POSE, None])[..., 0]
-        solved = _solved(found.information, wide, lacking.unsqueeze(-1))
-        steps = apart + (wide[..., _POSE] @ solved)[..., 0]
-        density = found.log_density - 0.5 * (apart * _solve(wide, apart.unsqueeze(-1))[..., 0]).sum(
-            -1
-        )
+        gradient = found.gradient - (found.information @ to_prior[..., _POSE, None])[..., 0]
+        solved = _solved(found.information, wide, gradient.unsqueeze(-1))
+        steps = to_prior + (wide[..., _POSE] @ solved)[..., 0]
+        whitened = _solve(wide, to_prior.unsqueeze(-1))[..., 0]
+        log_density = found.log_density - 0.5 * (to_prior * whitened).sum(-1)
         near = kernel(Se3, _pose_of(x).unsqueeze(2), self._scale(covariance, found))
         attitude = x[..., 6:10]
         pose = steps[..., _POSE]
@@ -247,27 +241,27 @@ class SteinViFilter(Localizer[SteinViBelief]):
         phi = stein_step(near, body, torch.ones_like(body[..., :2]), self.repulsion)[..., 0, :]
         pose = concat((rotate(attitude, phi[..., :3]), phi[..., 3:]))
         inner = covariance[..., _POSE, :][..., _POSE]
-        following = _solve(inner, covariance[..., _POSE, :][..., _REST])
-        alone = apart[..., _REST] - apart[..., _POSE] @ following
-        rest = mean_over(near, alone) + pose @ following
+        gain = _solve(inner, covariance[..., _POSE, :][..., _REST])
+        alone = to_prior[..., _REST] - to_prior[..., _POSE] @ gain
+        rest = mean_over(near, alone) + pose @ gain
         delta = concat((pose[..., :3], rest[..., :3], pose[..., 3:], rest[..., 3:]))
         targets = process.boxplus(x, steps).unsqueeze(2)
-        estimate = map_estimate(self._states, targets, density, near.k)
+        estimate = map_estimate(self._states, targets, log_density, near.k)
         return process.boxplus(x, self.pace * delta), estimate[:, :, 0]
 
-    def _scale(self, covariance: Float64[Tensor, "B N 15 15"], found: Sighted) -> Scale:
-        """The posterior's deviations of position and attitude, which measure distances."""
+    def _scale(self, covariance: Float64[Tensor, "B N 15 15"], found: LandmarkFit) -> Scale:
+        """The posterior's standard deviations of position and attitude, as units of the kernel."""
         inner = covariance[..., _POSE, :][..., _POSE]
         information = found.information.mean(2)
-        left = inner - inner @ _solved(information, covariance, information @ inner)
-        variance = left.diagonal(dim1=-2, dim2=-1)
+        posterior = inner - inner @ _solved(information, covariance, information @ inner)
+        variance = posterior.diagonal(dim1=-2, dim2=-1)
         return Scale(variance[..., :3].mean(-1).sqrt(), variance[..., 3:].mean(-1).sqrt())
 
 
 def _solved(
     information: Float64[Tensor, "*s 6 6"], covariance: Tensor, right: Float64[Tensor, "*s 6 k"]
 ) -> Float64[Tensor, "*s 6 k"]:
-    """(I + A P_pp)⁻¹ of what stands on the right."""
+    """(I + A P_pp)⁻¹ ``right``."""
     inner = covariance[..., _POSE, :][..., _POSE]
     eye = torch.eye(6, dtype=inner.dtype, device=inner.device)
     return _solve(eye + information @ inner, right)

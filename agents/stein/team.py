@@ -1,11 +1,10 @@
-"""What localizers of relative poses share: what they believe, guesses to start from, and how an
-estimate relative to UAV 0 is said in the world frame."""
+"""The base of localizers of relative poses: beliefs, initial poses, and world estimates."""
 
 import math
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
@@ -17,8 +16,8 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Odometry, Reference, RelativePose
 
-_START = (5.0, 0.5 * math.pi)  # m, rad: what matches count with at first
-_KNOWN = 1e-6  # m²: variance of UAV 0's position, which is where it is by definition
+_START = (5.0, 0.5 * math.pi)  # m, rad: initial standard deviations of matches
+_KNOWN = 1e-6  # m²: variance of the position of UAV 0, which is the reference
 
 B = TypeVar("B")
 
@@ -38,31 +37,31 @@ class RelativeTeam(Localizer[B]):
             raise ValueError("a team with relative poses, odometry and a reference is needed")
         if believed.slots < arena.n_uavs:
             raise ValueError(f"a team of {arena.n_uavs} needs as many slots, not {believed.slots}")
-        if not 0 < outliers < 1:
-            raise ValueError(f"outliers={outliers} is not allowed: a share in (0, 1)")
-        if not 0 < anneal <= 1:
-            raise ValueError(f"anneal={anneal} is not allowed: a factor in (0, 1]")
         self.poses, self.matches, self.odometry = poses_in(arena.dim), matches, odometry
         self.outliers, self.anneal = outliers, anneal
         sides = [b - a for a, b in zip(arena.low, arena.high, strict=True)]
         turns = self.poses.dof - arena.dim
         self.volume = math.prod(sides) * (8 * math.pi**2 if turns == 3 else 2 * math.pi)
         self.uniform = [s * s / 12 for s in sides] + [math.pi**2 / 3] * turns
-        self.std = [float(s) * arena.dt for s in odometry.std(torch.zeros(self.poses.dof).double())]
+        self.std = [
+            float(s) * arena.dt
+            for s in odometry.std(torch.zeros(self.poses.dof, dtype=torch.float64))
+        ]
 
     @property
     def exchanges(self) -> bool:
         return True
 
     def scale(self, annealed: Int64[Tensor, "B H"]) -> Scale:
-        """What matches count with after so many steps: max(σ, 5 ρᵗ m) and max(σ, ½π ρᵗ)."""
+        """Standard deviations of matches after t steps of annealing: max(σ_p, 5 ρᵗ m) and
+        max(σ_r, ½π ρᵗ)."""
         factor = self.anneal ** annealed.double()
         return Scale(
             (_START[0] * factor).clamp_min(self.matches.std),
             (_START[1] * factor).clamp_min(self.matches.turn_std),
         )
 
-    def anywhere(
+    def uniform_poses(
         self, key: Int64[Tensor, "B H"], origin: Float64[Tensor, "B H P"], agents: int, count: int
     ) -> Float64[Tensor, "B H A m P"]:
         """Poses uniform in the arena and over all rotations, relative to ``origin``."""
@@ -80,28 +79,29 @@ class RelativeTeam(Localizer[B]):
         x = poses.between(origin[:, :, None, None], torch.cat((place, turn), -1))
         return x.transpose(2, 3)
 
-    def said(
+    def world_estimate(
         self,
         own: Float64[Tensor, "B N P"],
         covariance: Float64[Tensor, "B N d d"],
         origin: Float64[Tensor, "B N P"],
         observation: Observation,
-        begun: Tensor,
+        moved: Bool[Tensor, "B N"],
     ) -> Estimate:
         """Each UAV's estimate of itself (relative to UAV 0, at ``origin``; covariance in its own
-        body frame) in the world frame, its velocity by odometry once a step has passed."""
+        body frame) in the world frame, its velocity by odometry (0 in the first step, before it
+        has ``moved``)."""
         world = self.poses.compose(origin, own)
         position, attitude = self.poses.split(world)
         rotation = rotation_matrix(attitude)
-        spread = rotation @ covariance @ rotation.mT
-        spread = 0.5 * (spread + spread.mT)
-        eye = torch.eye(self.poses.dim, dtype=spread.dtype, device=spread.device)
-        first = (torch.arange(spread.shape[1], device=spread.device) == 0)[:, None, None]
+        covariance = rotation @ covariance @ rotation.mT
+        covariance = 0.5 * (covariance + covariance.mT)
+        eye = torch.eye(self.poses.dim, dtype=covariance.dtype, device=covariance.device)
+        first = (torch.arange(covariance.shape[1], device=covariance.device) == 0)[:, None, None]
         speed = observation["odometry"][..., : self.poses.dim].double()
         return build(
             Estimate,
             own.shape[:2],
             position=position,
-            velocity=torch.where(begun.unsqueeze(-1), rotate(attitude, speed), 0.0),
-            covariance=torch.where(first, _KNOWN * eye, spread),
+            velocity=torch.where(moved.unsqueeze(-1), rotate(attitude, speed), 0.0),
+            covariance=torch.where(first, _KNOWN * eye, covariance),
         )

@@ -1,8 +1,9 @@
-"""Stein variational gradient descent on groups of poses (Liu & Wang 2016; CSPF paper, eq. 15).
+"""Stein variational gradient descent (SVGD) on groups of poses (Liu & Wang 2016; CSPF paper,
+equation 15).
 
-Distances and repulsions are products of matrices: a cloud of poses is a cloud of points
+Distances and repulsions are products of matrices: poses are embedded as points
 [t/s_p, R/(√2 s_r)], all agents side by side, whose squared distances are |Δt|²/s_p² +
-(2 sin ½angle)²/s_r².
+(2 sin ½θ)²/s_r².
 """
 
 import math
@@ -18,76 +19,76 @@ from coloc_env.geometry import Poses, rotation_matrix
 
 @dataclass(frozen=True)
 class Kernel:
-    """k = exp(−q²/2h²) between particles, h² by the median rule h² = median(q²)/(2 log(m+1)), and
-    the particles' positions and rotations that it was made from."""
+    """k = exp(−q²/2h²) between particles, ``bandwidth`` h² = median(q²)/(2 log(m+1)) (the median
+    rule), and the particles' positions and rotations."""
 
     k: Float64[Tensor, "B H m m"]
-    h: Float64[Tensor, "B H"]
+    bandwidth: Float64[Tensor, "B H"]
     position: Float64[Tensor, "B H m N d"]
     rotation: Float64[Tensor, "B H m N d d"]
 
 
 def kernel(poses: type[Poses], x: Float64[Tensor, "B H N m P"], scale: Scale) -> Kernel:
-    """The kernel of q² = Σ |Δt|²/s_p² + (2 sin ½angle)²/s_r² over all agents (UAV 0, which is where
-    it is by definition, adds nothing)."""
+    """The kernel of q² = Σ |Δt|²/s_p² + (2 sin ½θ)²/s_r² over all agents (UAV 0, which is the
+    reference, adds nothing)."""
     position, attitude = poses.split(x.transpose(2, 3))
     rotation = rotation_matrix(attitude)
-    here = position.flatten(-2) / scale.position[..., None, None]
+    scaled = position.flatten(-2) / scale.position[..., None, None]
     turned = rotation.flatten(-3) / (math.sqrt(2) * scale.turn[..., None, None])
-    points = torch.cat((here, turned), -1)
+    points = torch.cat((scaled, turned), -1)
     lengths = points.square().sum(-1)
     products = points @ points.mT
     q = (lengths.unsqueeze(-1) + lengths.unsqueeze(-2) - 2 * products).clamp_min(0.0)
     median = q.flatten(-2).median(-1).values
-    h = (median / (2 * math.log(q.shape[-1] + 1))).clamp_min(1e-12)
-    return Kernel(torch.exp(q * (-0.5 / h)[..., None, None]), h, position, rotation)
+    bandwidth = (median / (2 * math.log(q.shape[-1] + 1))).clamp_min(1e-12)
+    return Kernel(torch.exp(q * (-0.5 / bandwidth)[..., None, None]), bandwidth, position, rotation)
 
 
 def stein_step(
     near: Kernel,
     steps: Float64[Tensor, "B H m N D"],
-    density: Float64[Tensor, "B H m N 2"],
+    information: Float64[Tensor, "B H m N 2"],
     repulsion: float,
 ) -> Float64[Tensor, "B H m N D"]:
-    """The direction Φ of eq. 15, preconditioned: the kernel-weighted mean of the particles' own
-    Gauss–Newton ``steps``, and ``repulsion`` times the kernel's gradient over the ``density`` of
-    information (of position and turn, in units of the scale's).
+    """The direction φ* of equation 15, preconditioned: Σ_r k_lr s_r / Σ_r k_lr of the particles'
+    Gauss–Newton ``steps`` s (equation 17), and ``repulsion`` times Σ_r ∇k_lr over their
+    ``information`` (of position and turn, in units of the scale's).
 
-    Tangents of different particles are averaged in the frame that they share, not in their own.
+    Tangents of different particles are averaged in a common frame, not in their own.
     """
     rotation, d = near.rotation, near.position.shape[-1]
     total = near.k.sum(-1)
-    apart = total[..., None, None] * near.position - _mixed(near.k, near.position)
-    turned = rotation.mT @ _mixed(near.k, rotation)
-    push = (_into(rotation, apart), -_axis(turned))
+    gradient = total[..., None, None] * near.position - _weighted_sum(near.k, near.position)
+    turned = rotation.mT @ _weighted_sum(near.k, rotation)
+    push = (_to_body(rotation, gradient), -_axis(turned))  # h² Σ_r ∇k_lr
     parts = []
     for part, moved in enumerate((steps[..., :d], steps[..., d:])):
-        alike = part == 1 and d == 2  # a turn in the plane is the same in any frame
-        shared = moved if alike else _out(rotation, moved)
-        pull = _mixed(near.k, shared)
-        pull = pull if alike else _into(rotation, pull)
-        away = repulsion / (near.h[..., None, None] * density[..., part])
+        planar = part == 1 and d == 2  # a rotation in the plane is the same in any frame
+        shared = moved if planar else _to_world(rotation, moved)
+        pull = _weighted_sum(near.k, shared)
+        pull = pull if planar else _to_body(rotation, pull)
+        away = repulsion / (near.bandwidth[..., None, None] * information[..., part])
         parts.append((pull + away.unsqueeze(-1) * push[part]) / total[..., None, None])
     return torch.cat(parts, -1)
 
 
 def mean_over(near: Kernel, values: Float64[Tensor, "B H m E"]) -> Float64[Tensor, "B H m E"]:
-    """Kernel-weighted means of what particles have beside their poses."""
-    return _mixed(near.k, values) / near.k.sum(-1, keepdim=True)
+    """Kernel-weighted means of the particles' ``values``."""
+    return _weighted_sum(near.k, values) / near.k.sum(-1, keepdim=True)
 
 
-def _mixed(k: Float64[Tensor, "B H m m"], values: Float64[Tensor, "B H m *x"]) -> Tensor:
+def _weighted_sum(k: Float64[Tensor, "B H m m"], values: Float64[Tensor, "B H m *x"]) -> Tensor:
     """Σ_r k_lr v_r."""
     return (k @ values.flatten(3)).unflatten(-1, values.shape[3:])
 
 
-def _out(rotation: Tensor, v: Tensor) -> Tensor:
-    """Body-frame vectors in the shared frame."""
+def _to_world(rotation: Tensor, v: Tensor) -> Tensor:
+    """Body-frame vectors in the common frame."""
     return (rotation * v.unsqueeze(-2)).sum(-1)
 
 
-def _into(rotation: Tensor, v: Tensor) -> Tensor:
-    """Vectors of the shared frame in body frames."""
+def _to_body(rotation: Tensor, v: Tensor) -> Tensor:
+    """Vectors of the common frame in body frames."""
     return (rotation * v.unsqueeze(-1)).sum(-2)
 
 

@@ -1,4 +1,4 @@
-"""What a swarm's localizer knows between steps, what a step brings, and what is found from it."""
+"""What a swarm filter carries from step to step, the inputs of a step, and its solution."""
 
 from dataclasses import dataclass, replace
 
@@ -7,100 +7,124 @@ from jaxtyping import Bool, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.swarm import delays, joint
 from agents.swarm.calibration import ErrorModel
 from agents.swarm.delays import Delays
-from agents.swarm.drift import Drift
-from agents.swarm.links import Links
-from agents.swarm.window import History
+from agents.swarm.ins_bias import InsBias
+from agents.swarm.links import Links, lengths
+from agents.swarm.window import RangeWindow
 
 UNKNOWN = 1e12  # m²: variance of a position of which nothing is known
 
 
 class SwarmBelief(TensorClass):
-    """Dead-reckoned state with the position last found, that position's variance (m², per axis) and
-    its rows of the team's joint covariance (``agents.swarm.joint``, m²; none where it is not kept);
-    the INS's bias (m/s) with its covariance with the position (m²/s) and its variance (m²/s²);
-    steps taken; and, the same for all, what is remembered of ranges' errors and of how links change
-    between clean and obstructed; of each link how likely it is obstructed (``paper``: how often it
-    was silent; none where that is not used); whether the UAV is ``localizable``: connected to so
-    many with fixes that they settle a position, d + 1; the ``past`` steps of a sliding window (none
-    where there is no such); what antennas add to ranges (``delays``). Batch (B, N)."""
+    """The belief of a swarm filter, batch (B, N).
+
+    ``state``: position as last estimated and the rest of the state by dead reckoning;
+    ``variance`` of the position (m² per axis); ``joint``: the UAV's rows of the team's joint
+    covariance (m², see ``agents.swarm.joint``; of width 0 where it is not kept); ``ins_bias``;
+    ``step``: steps taken; ``error_sums`` and ``transitions``: sufficient statistics of the range
+    errors and of how links change between line of sight and NLOS, the same for all UAVs;
+    ``link_memory``: what the confidence remembers of each link (of width 0: nothing);
+    ``localizable``: connected to at least d + 1 anchors; ``window`` of past steps (of length 0:
+    none); ``delays`` of antennas and clocks.
+    """
 
     state: Float64[Tensor, "B N S"]
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"]
-    bias: Float64[Tensor, "B N d"]
-    drift: Float64[Tensor, "B N 2"]
+    ins_bias: InsBias
     step: Int64[Tensor, "B N"]
-    errors: Float64[Tensor, "B N 2 3"]
-    chain: Float64[Tensor, "B N 2 2"]
-    memory: Float64[Tensor, "B N L"]
+    error_sums: Float64[Tensor, "B N 2 3"]
+    transitions: Float64[Tensor, "B N 2 2"]
+    link_memory: Float64[Tensor, "B N L"]
     localizable: Bool[Tensor, "B N"]
-    past: History
+    window: RangeWindow
     delays: Delays
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """What a step has to find positions from: everybody's dead-reckoned ``state``, its ``place`` by
-    dead reckoning or fix (m), that place's ``variance`` (m² per axis) and what the step ``added``
-    to it, who is ``fixed``, the ``links``, the ``model`` of their errors; the variance that dead
-    reckoning alone has (``reckoned``), the joint covariance of the places (none where it is not
-    kept), the variance of the vectors ``between`` them (m² per axis), the INS's ``drift`` (None:
-    not estimated), how links change (``chain``), the probability that each is an ``outlier``
-    beforehand (None: as many as there are in all), how often each was ``silent`` (``paper`` only);
-    and by what factor each link's weight is changed from outside (``confidence``: held down in
-    [0, 1], above where it stands for several ranges; None: not at all); the ``past`` steps as they
-    look from now (None: no window); what antennas add to ranges (``delays``), taken off the links'
-    distances as far as it is known."""
+class StepInput:
+    """What the positions of a step are computed from.
+
+    ``state``: predicted by dead reckoning; ``prior``: the position m predicted or, at anchors,
+    fixed (m); ``variance`` P of the prior (m² per axis) and ``process_noise`` q² that the step
+    added to it; ``fixed``: who has a position fix; ``links``: ranges d̃_ij, without the delays that
+    are known; ``error_model`` of ranges; ``predicted_variance``: P before fixes (m²); ``joint``:
+    joint covariance of the priors (m²; of width 0 where it is not kept); ``pair_variance`` of the
+    vectors between UAVs (m² per axis); ``ins_bias`` (None: not estimated); ``transitions`` of links
+    between line of sight and NLOS; ``delays``; ``outlier_probability`` of each link beforehand
+    (None: the share of all); ``packet_loss``: share of steps without a range, ρ_ij of equation 17
+    (None: not used); ``confidence``: factor c_ij on each link's weight from outside (None: 1; above
+    1 where a link stands for several ranges); ``window`` of past steps, moved on to the present
+    (None: no window).
+    """
 
     state: Float64[Tensor, "B N S"]
-    place: Float64[Tensor, "B N d"]
+    prior: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
-    added: Float64[Tensor, "B N"]
+    process_noise: Float64[Tensor, "B N"]
     fixed: Bool[Tensor, "B N"]
     links: Links
-    model: ErrorModel
-    reckoned: Float64[Tensor, "B N"]
+    error_model: ErrorModel
+    predicted_variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"]
-    between: Float64[Tensor, "B N N"]
-    drift: Drift | None
-    chain: Float64[Tensor, "B 2 2"]
+    pair_variance: Float64[Tensor, "B N N"]
+    ins_bias: InsBias | None
+    transitions: Float64[Tensor, "B 2 2"]
     delays: Delays
-    outlier: Float64[Tensor, "B N N"] | None = None
-    silent: Float64[Tensor, "B N N"] | None = None
+    outlier_probability: Float64[Tensor, "B N N"] | None = None
+    packet_loss: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
-    past: History | None = None
+    window: RangeWindow | None = None
 
 
 @dataclass(frozen=True)
-class Found:
-    """Positions (m), their variance (m² per axis), the joint covariance if there is one, the window
-    of steps with this one in it and what antennas add to ranges (None: as it was)."""
+class Solution:
+    """Positions (m), their ``variance`` (m² per axis), the ``joint`` covariance (None: not kept),
+    the ``window`` with this step in it and the ``delays`` (None: as before)."""
 
     position: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"] | None = None
-    past: History | None = None
+    window: RangeWindow | None = None
     delays: Delays | None = None
 
+    def residual(self, inputs: StepInput) -> Float64[Tensor, "B N N"]:
+        """d̃_ij − ‖p_i − p_j‖ (m), less this step's correction of the delays."""
+        residual = inputs.links.distance - lengths(self.position.detach())
+        if self.delays is None:
+            return residual
+        return residual - delays.offsets(self.delays.delay - inputs.delays.delay)
 
-def begun(now: Prepared) -> Prepared:
-    """The same where every UAV has a place to start from: who has none (a prior that is no number)
-    gets the middle of its neighbours', or of all, with a variance of ``UNKNOWN``."""
-    known = now.place.isfinite().all(-1)
-    if bool(known.all()):
-        return now
-    place = torch.where(known.unsqueeze(-1), now.place, 0.0)
-    count = known.double().unsqueeze(-1)
-    linked = now.links.mask.double()
-    near, everywhere = linked @ count, count.sum(1, keepdim=True).clamp_min(1.0)
-    middle = torch.where(
-        near > 0, linked @ place / near.clamp_min(1.0), place.sum(1, keepdim=True) / everywhere
+    def range_variance(self, inputs: StepInput) -> Float64[Tensor, "B N N"]:
+        """Variance (m²) of each predicted range; that of the prior where there is no joint
+        covariance."""
+        if self.joint is None:
+            return inputs.pair_variance
+        variance = joint.pair_variance(self.joint)
+        return variance if self.delays is None else variance + delays.offset_variance(self.delays)
+
+
+def with_finite_prior(inputs: StepInput) -> StepInput:
+    """The same with a finite prior for every UAV: one whose prior is not finite gets the mean of
+    its neighbours' priors (of all, if it has none) with variance ``UNKNOWN``."""
+    finite = inputs.prior.isfinite().all(-1)
+    if bool(finite.all()):
+        return inputs
+    prior = torch.where(finite.unsqueeze(-1), inputs.prior, 0.0)
+    count = finite.double().unsqueeze(-1)
+    linked = inputs.links.mask.double()
+    neighbours, team = linked @ count, count.sum(1, keepdim=True).clamp_min(1.0)
+    mean = torch.where(
+        neighbours > 0,
+        linked @ prior / neighbours.clamp_min(1.0),
+        prior.sum(1, keepdim=True) / team,
     )
+    pairs = finite.unsqueeze(-1) & finite.unsqueeze(-2)
     return replace(
-        now,
-        place=torch.where(known.unsqueeze(-1), place, middle),
-        variance=torch.where(known, now.variance, UNKNOWN),
-        between=torch.where(known.unsqueeze(-1) & known.unsqueeze(-2), now.between, UNKNOWN),
+        inputs,
+        prior=torch.where(finite.unsqueeze(-1), prior, mean),
+        variance=torch.where(finite, inputs.variance, UNKNOWN),
+        pair_variance=torch.where(pairs, inputs.pair_variance, UNKNOWN),
     )

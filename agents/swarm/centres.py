@@ -12,11 +12,10 @@ from coloc_env.sensors.ranging import Tags
 
 
 class Centres:
-    """The links of a team of N, and of the A anchors that it believes in, if any, as one graph of
-    M = N + A centres.
+    """The links of N UAVs and A anchors as one graph of M = N + A centres.
 
-    Where attitude is known, a range is corrected for the lever arms of its tags; where not, they
-    are noise. Several ranges between two centres are averaged.
+    Where attitude is estimated, a range is corrected for the lever arms of its tags; where not, the
+    arms are noise. Several ranges between two centres are averaged.
     """
 
     def __init__(self, believed: Believed, ranging: Ranging) -> None:
@@ -24,8 +23,8 @@ class Centres:
         self.anchors = believed.sensor(AnchorRanging)
         self.count = len(self.anchors.anchors) if self.anchors else 0
 
-    def places(self, observation: Observation) -> Float64[Tensor, "B A d"]:
-        """Where the anchors are (m)."""
+    def anchor_positions(self, observation: Observation) -> Float64[Tensor, "B A d"]:
+        """Positions of the anchors (m)."""
         if self.anchors is None:
             return observation["prior"].new_zeros(len(observation["prior"]), 0, self.dim).double()
         return observation["anchor_map"][:, 0].double().unflatten(-1, (-1, self.dim))
@@ -33,25 +32,25 @@ class Centres:
     def links(
         self,
         observation: Observation,
-        place: Float64[Tensor, "B N d"],
+        position: Float64[Tensor, "B N d"],
         rotation: Float64[Tensor, "B N d d"] | None,
     ) -> tuple[Links, Float64[Tensor, "B M M"]]:
-        """Distances between centres, at places and attitudes (body to world) that are about right,
-        and how many single ranges between UAVs each is worth; none between anchors."""
-        inside, worth = self._between(observation, place, rotation)
+        """Distances between centres, from approximate positions and attitudes (body to world), and
+        each link's weight in units of a single range between UAVs; no links between anchors."""
+        team, team_weight = self._between_uavs(observation, position, rotation)
         if self.anchors is None:
-            return inside, worth
-        across, shares = self._to_anchors(observation, self.anchors, place, rotation)
+            return team, team_weight
+        across, weight = self._to_anchors(observation, self.anchors, position, rotation)
 
-        def joined(ours: Tensor, theirs: Tensor) -> Tensor:
-            none = ours.new_zeros(len(ours), self.count, self.count)
-            rows = torch.cat((ours, theirs), -1), torch.cat((theirs.mT, none), -1)
+        def joined(uavs: Tensor, anchors: Tensor) -> Tensor:
+            none = uavs.new_zeros(len(uavs), self.count, self.count)
+            rows = torch.cat((uavs, anchors), -1), torch.cat((anchors.mT, none), -1)
             return torch.cat(rows, -2)
 
-        links = Links(joined(inside.distance, across.distance), joined(inside.mask, across.mask))
-        return links, joined(worth, shares)
+        links = Links(joined(team.distance, across.distance), joined(team.mask, across.mask))
+        return links, joined(team_weight, weight)
 
-    def surveyed(self, links: Links, anchors: Float64[Tensor, "B A d"]) -> Links:
+    def with_surveyed(self, links: Links, anchors: Float64[Tensor, "B A d"]) -> Links:
         """The same links with those between anchors, whose lengths are known."""
         n = links.mask.shape[-1] - self.count
         distance, mask = links.distance.clone(), links.mask.clone()
@@ -59,67 +58,68 @@ class Centres:
         distance[:, n:, n:] = lengths(anchors) * mask[:, n:, n:]
         return Links(distance, mask)
 
-    def _between(
+    def _between_uavs(
         self,
         observation: Observation,
-        place: Float64[Tensor, "B N d"],
+        position: Float64[Tensor, "B N d"],
         rotation: Float64[Tensor, "B N d d"] | None,
     ) -> tuple[Links, Float64[Tensor, "B N N"]]:
         ranges, mask = ranges_of(observation, self.ranging.n_tags)
-        arms, spread = _arms(self.ranging.tags, place, rotation)
+        arms, variance = _arms(self.ranging.tags, position, rotation)
         if arms is not None:
             offset = arms[:, None, :, None] - arms[:, :, None, :, None]  # [B, i, j, a, b, d]
-            apart = place.unsqueeze(1) - place.unsqueeze(2)
-            unit = apart / lengths(place).unsqueeze(-1)
-            ranges = centred(ranges, offset, unit[..., None, None, :])
-        share = 1 / (1 + 2 * spread / self.ranging.noise.std**2)
-        return _averaged(ranges.flatten(3), mask.flatten(3), share)
+            difference = position.unsqueeze(1) - position.unsqueeze(2)
+            unit = difference / lengths(position).unsqueeze(-1)
+            ranges = centre_distance(ranges, offset, unit[..., None, None, :])
+        weight = 1 / (1 + 2 * variance / self.ranging.noise.std**2)
+        return _averaged(ranges.flatten(3), mask.flatten(3), weight)
 
     def _to_anchors(
         self,
         observation: Observation,
         sensor: AnchorRanging,
-        place: Float64[Tensor, "B N d"],
+        position: Float64[Tensor, "B N d"],
         rotation: Float64[Tensor, "B N d d"] | None,
     ) -> tuple[Links, Float64[Tensor, "B N A"]]:
         shape = (sensor.n_tags, -1)
         ranges = observation["anchor_ranges"].double().unflatten(-1, shape).mT  # [B, N, A, T]
         mask = (observation["anchor_range_mask"] > 0).unflatten(-1, shape).mT & ranges.isfinite()
-        arms, spread = _arms(sensor.tags, place, rotation)
+        arms, variance = _arms(sensor.tags, position, rotation)
         if arms is not None:
-            apart = self.places(observation).unsqueeze(1) - place.unsqueeze(2)
-            length = torch.linalg.vector_norm(apart, dim=-1, keepdim=True).clamp_min(1e-9)
-            ranges = centred(ranges, -arms.unsqueeze(2), (apart / length).unsqueeze(-2))
-        share = self.ranging.noise.std**2 / (sensor.noise.std**2 + spread)
-        return _averaged(ranges, mask, share)
+            difference = self.anchor_positions(observation).unsqueeze(1) - position.unsqueeze(2)
+            length = torch.linalg.vector_norm(difference, dim=-1, keepdim=True).clamp_min(1e-9)
+            unit = (difference / length).unsqueeze(-2)
+            ranges = centre_distance(ranges, -arms.unsqueeze(2), unit)
+        weight = self.ranging.noise.std**2 / (sensor.noise.std**2 + variance)
+        return _averaged(ranges, mask, weight)
 
 
-def centred(
+def centre_distance(
     ranges: Float64[Tensor, "*s"], offset: Float64[Tensor, "*s d"], unit: Float64[Tensor, "*#s d"]
 ) -> Float64[Tensor, "*s"]:
-    """The distance D (m) between two centres in direction ``unit`` whose tags, ``offset`` m further
-    apart, are ‖D u + o‖ = r m from each other."""
+    """The distance D (m) between two centres in direction u whose tags, offset by o (m), measure
+    ‖D u + o‖ = r (m)."""
     along = (unit * offset).sum(-1)
     squared = ranges.square() - offset.square().sum(-1) + along.square()
     return (squared.clamp_min(0).sqrt() - along).clamp_min(1e-9)
 
 
 def _arms(
-    tags: Tags, place: Float64[Tensor, "B N d"], rotation: Float64[Tensor, "B N d d"] | None
+    tags: Tags, position: Float64[Tensor, "B N d"], rotation: Float64[Tensor, "B N d d"] | None
 ) -> tuple[Float64[Tensor, "B N T d"] | None, float]:
-    """Lever arms in the world frame, or what not knowing them adds to a range's variance (m²)."""
+    """Lever arms in the world frame (m), or the variance (m²) that unknown ones add to a range."""
     if not tags:
         return None, 0.0
-    arms = place.new_tensor(tags)
+    arms = position.new_tensor(tags)
     if rotation is None:
-        return None, float(arms.square().sum(-1).mean()) / place.shape[-1]
+        return None, float(arms.square().sum(-1).mean()) / position.shape[-1]
     return (rotation.unsqueeze(2) @ arms.unsqueeze(-1))[..., 0], 0.0
 
 
 def _averaged(
-    ranges: Float64[Tensor, "B N M T"], mask: Bool[Tensor, "B N M T"], share: float
+    ranges: Float64[Tensor, "B N M T"], mask: Bool[Tensor, "B N M T"], weight: float
 ) -> tuple[Links, Float64[Tensor, "B N M"]]:
-    """One link for several ranges, each of which is worth a ``share`` of one; and its worth."""
+    """One link for several ranges of this ``weight`` each, and the weight of the link."""
     count = mask.sum(-1)
     mean = torch.where(mask, ranges, 0.0).sum(-1) / count.clamp_min(1)
-    return Links(mean, count > 0), share * count
+    return Links(mean, count > 0), weight * count.to(torch.float32)

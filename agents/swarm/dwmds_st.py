@@ -1,48 +1,50 @@
 """DW-MDS: dynamically weighted multidimensional scaling of a swarm (ST-DCL paper, Algorithm 1).
 
-The team's stress is minimized by majorization, warm-started where dead reckoning has carried each
-UAV. The paper's window of past ranges is folded into a recursive prior with a joint covariance,
-or kept as it is (``window``).
+The team's stress (equation 19) is minimized by majorization, warm-started at the positions of dead
+reckoning. The paper's window of past ranges is folded into a recursive prior with a joint
+covariance, or kept as it is (``window``).
 """
 
-import math
 from dataclasses import replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.kalman.filter import elapsed
-from agents.swarm import joint, window
-from agents.swarm.among_anchors import suited
-from agents.swarm.belief import Found, Prepared, SwarmBelief
-from agents.swarm.filter import Confidence, SwarmFilter
-from agents.swarm.majorization import pull, require_iterations
+from agents.swarm import joint
+from agents.swarm import window as windows
+from agents.swarm.anchored import supports_anchors
+from agents.swarm.belief import Solution, StepInput, SwarmBelief
+from agents.swarm.confidence import ConfidenceKind
+from agents.swarm.filter import SwarmFilter
+from agents.swarm.majorization import TEAM_RELAXATION, link_descent, require_iterations
+from coloc_env.options import Count, PositiveCount, PositiveSpeed, Quantity
 from coloc_env.scenario import Believed
 
-_REFRESH = (0, 2)  # iterations at which weights are made anew
-_SELDOM = 10  # and, in the first step, every so many
-_FORGOTTEN = 1e-9  # m⁻²: what a prior counts that is not used
-_RELAXED = 1.8  # of a Guttman step, which overestimates how much many ranges hold together
+_REWEIGHTED = (0, 2)  # iterations at which weights are computed
+_REWEIGHTED_EVERY = 10  # in the first step, as well
+_NO_PRIOR = 1e-9  # m⁻²: precision of a prior that is not used
 
 
-@suited
+@supports_anchors
 class DynamicMds(SwarmFilter):
     """Whole-team stress majorization with a recursive prior from dead reckoning.
 
-    What errors have in common is kept as one covariance for all axes, which does where UAVs have
-    twenty neighbours and more that surround them; ``map`` keeps all of it, at three times the cost.
+    The joint covariance is shared by all axes, which suffices where UAVs have twenty neighbours and
+    more in all directions; ``map`` keeps all of it, at three times the cost.
 
-    ``confidence``: how much a link counts: ``em`` by a two-component error model that is fitted to
-    the links between UAVs that know where they are, ``huber``, ``paper`` (Huber's, held down by
-    what the paper detects), or ``none`` (all alike). ``bias=false`` does not estimate the INS's.
-    ``prior=false`` forgets dead reckoning once it has been started from. ``v_max`` (m/s): no UAV is
-    said to be faster (the paper's projection). ``iterations`` a step, ``first`` in the first.
+    ``confidence``: weights of links: ``em`` by a mixture of errors that is fitted to the links
+    between anchors, ``huber``, ``paper`` (Huber's times equation 17), or ``none`` (all alike).
+    ``bias=false`` does not estimate the INS's. ``prior=false`` uses dead reckoning as the initial
+    guess only. ``v_max`` (m/s): bound of velocities (the paper's projection). ``iterations`` a
+    step, ``first`` in the first.
 
-    ``window``: the stress sums over the links of as many past steps, too, each where dead reckoning
-    says it was, with weights exp(−λ age), λ the ``decay`` in 1/s; the prior is then what was known
-    before the oldest of them. The paper's T is min(T_max, ⌈√(2R/a_max)/Δt⌉), R the radius of
-    communication. Displacements are held to be exact, their errors are what ``decay`` stands for.
+    ``window``: past steps in the stress, displaced by dead reckoning, with weights exp(−λ age), λ
+    the ``decay`` in 1/s; the prior is then that of the oldest of them. The paper's T is
+    min(T_max, ⌈√(2R/a_max)/Δt⌉), R the radius of communication. Displacements are taken for exact,
+    ``decay`` stands for their errors.
     """
 
     name = "dwmds_st"
@@ -51,115 +53,118 @@ class DynamicMds(SwarmFilter):
         self,
         believed: Believed,
         *,
-        confidence: Confidence = "em",
+        confidence: ConfidenceKind = "em",
         bias: bool = True,
         prior: bool = True,
-        v_max: float | None = None,
-        window: int = 0,
-        decay: float = 0.05,
-        iterations: int = 5,
-        first: int = 60,
+        v_max: PositiveSpeed | None = None,
+        window: Count = 0,
+        decay: Annotated[float, Quantity("1/s", 0.0)] = 0.05,
+        iterations: PositiveCount = 5,
+        first: PositiveCount = 60,
     ) -> None:
         super().__init__(believed, confidence, bias)
         require_iterations(iterations, first)
-        if v_max is not None and not v_max > 0:
-            raise ValueError(f"v_max={v_max} is not allowed: a speed in m/s > 0")
-        if window < 0:
-            raise ValueError(f"window={window} is not allowed: a number of steps ≥ 0")
-        if not 0 <= decay < math.inf:
-            raise ValueError(f"decay={decay} is not allowed: a rate in 1/s ≥ 0")
         self.prior, self.iterations, self.first, self.v_max = prior, iterations, first, v_max
         self.window, self.decay = window, decay
         self.recursive = prior
 
-    def joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
+    def initial_joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
         return joint.independent(variance, 1)
 
-    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        """Algorithm 1's inner loop, and the covariance of what it finds."""
-        begins = (belief.step == 0).any(-1)[:, None, None]
-        index = joint.moving(now.fixed)
-        place, known = (now.place, now.joint) if now.past is None else window.before(now.past)
-        trust = self.trust(known, now.fixed, index)
-        holds = informs = trust
-        if now.past is not None:
-            holds = trust + joint.laplacian(now.past.weight.sum(2), index)
-            informs = trust + joint.laplacian(now.past.told.sum(2) / self.process.dim, index)
-        still, distance = now.fixed.unsqueeze(-1), now.links.distance
-        y, at, factor = now.place, now, trust
+    def solve(self, belief: SwarmBelief, inputs: StepInput) -> Solution:
+        """Algorithm 1's inner loop, y ← y + ω V⁻¹ (−½ ∂S/∂y), and the covariance of its result."""
+        first_step = (belief.step == 0).any(-1)[:, None, None]
+        free = joint.free_indices(inputs.fixed)
+        fixed, window = inputs.fixed.unsqueeze(-1), inputs.window
+        prior, covariance = inputs.prior, inputs.joint
+        if window is not None:
+            prior, covariance = windows.oldest_prior(window)
+        precision = self._precision(covariance, inputs.fixed, free)  # Λ
+        majorant, information = precision, precision  # of all terms but the step's own links
+        if window is not None:
+            past = window.information.sum(2) / self.process.dim
+            majorant = precision + joint.laplacian(window.weight.sum(2), free)
+            information = precision + joint.laplacian(past, free)
+        distance = inputs.links.distance
+        y, weighting, factor = inputs.prior, inputs, precision
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
-        relaxed = _RELAXED if self.dense else 1.0
-        for k in range(self.first if bool(begins.any()) else self.iterations):
-            goes_on = begins | (k < self.iterations)  # a world that is not new stops earlier
-            if k in _REFRESH or k % _SELDOM == 0:
-                if k == _REFRESH[-1] and bool(begins.any()):
-                    at = self.nearer(weight, informs, now, begins)
+        relaxation = TEAM_RELAXATION if self.dense else 1.0  # ω
+        for k in range(self.first if bool(first_step.any()) else self.iterations):
+            active = first_step | (k < self.iterations)  # other worlds have fewer iterations
+            if k in _REWEIGHTED or k % _REWEIGHTED_EVERY == 0:
+                if k == _REWEIGHTED[-1] and bool(first_step.any()):
+                    weighting = self._first_reweighting(weight, information, inputs, first_step)
                 weight, shift = (
-                    torch.where(goes_on, new, old)
-                    for new, old in zip(self.weigh(y, at), (weight, shift), strict=True)
+                    torch.where(active, new, old)
+                    for new, old in zip(self.weights(y, weighting), (weight, shift), strict=True)
                 )
-                links = joint.laplacian(weight, index)
-                factor = torch.linalg.cholesky_ex(joint.held(links + holds, now.fixed[:, index])).L
-            down = pull(y, distance - shift, weight)
-            if now.past is not None:
-                down = down + window.pull(y, now.past)
-            down = torch.where(still, 0.0, down)[:, index]
-            down = down + trust @ (place - y)[:, index]
-            step = relaxed * torch.cholesky_solve(down, factor)
-            y = torch.where(goes_on, y.index_add(1, index, step), y)
+                v = joint.pin(joint.laplacian(weight, free) + majorant, inputs.fixed[:, free])
+                factor = torch.linalg.cholesky_ex(v).L  # V, the Laplacian of W plus Λ
+            descent = link_descent(y, distance - shift, weight)
+            if window is not None:
+                descent = descent + windows.descent(y, window)
+            descent = torch.where(fixed, 0.0, descent)[:, free]
+            descent = descent + precision @ (prior - y)[:, free]
+            step = relaxation * torch.cholesky_solve(descent, factor)
+            y = torch.where(active, y.index_add(1, free, step), y)
         if self.v_max is not None:
-            y = self.slowed(belief, now, y)
-        weight, shift = self.weigh(y, at)
-        together = self.known(weight, informs, now, index)
-        past = now.past
-        if past is not None:
-            told = self.told(weight, now)
-            past = window.pushed(past, now.place, now.joint, distance - shift, weight, told)
-        return Found(y, joint.variances(together), together, past)
+            y = self._projected(belief, inputs, y)
+        weight, shift = self.weights(y, weighting)
+        posterior = self._posterior(weight, information, inputs, free)
+        if window is not None:
+            each = self.confidence.information(weight, inputs)
+            window = windows.push(
+                window, inputs.prior, inputs.joint, distance - shift, weight, each
+            )
+        return Solution(y, joint.marginal_variances(posterior), posterior, window)
 
-    def trust(
+    def _precision(
         self,
-        known: Float64[Tensor, "B N e K"],
+        covariance: Float64[Tensor, "B N e K"],
         fixed: Bool[Tensor, "B N"],
-        index: Int64[Tensor, "M"],
+        free: Int64[Tensor, "M"],
     ) -> Float64[Tensor, "B L L"]:
-        """What dead reckoning is worth (1/m²) to those in ``index``."""
+        """The precision Λ = P⁻¹ of the prior (1/m²), at free UAVs."""
         if self.prior:
-            return joint.precision(joint.among(known, index), fixed[:, index])
-        return torch.diag_embed(_FORGOTTEN * (~fixed[:, index]).double())
+            return joint.precision(joint.submatrix(covariance, free), fixed[:, free])
+        return torch.diag_embed(_NO_PRIOR * (~fixed[:, free]).double())
 
-    def known(
+    def _posterior(
         self,
         weight: Float64[Tensor, "B N N"],
-        trust: Float64[Tensor, "B L L"],
-        now: Prepared,
-        index: Int64[Tensor, "M"],
+        information: Float64[Tensor, "B L L"],
+        inputs: StepInput,
+        free: Int64[Tensor, "M"],
     ) -> Float64[Tensor, "B N e K"]:
-        """The joint covariance of positions."""
-        told = joint.laplacian(self.told(weight, now) / self.process.dim, index)
-        part = joint.posterior(told + trust, now.fixed[:, index], now.variance[:, index])
-        return joint.whole(part, index, now.variance)
+        """The joint covariance by the step's links and all other ``information`` (1/m²)."""
+        each = self.confidence.information(weight, inputs) / self.process.dim
+        total = joint.laplacian(each, free) + information
+        part = joint.posterior(total, inputs.fixed[:, free], inputs.variance[:, free])
+        return joint.embed(part, free, inputs.variance)
 
-    def nearer(
+    def _first_reweighting(
         self,
         weight: Float64[Tensor, "B N N"],
-        trust: Float64[Tensor, "B L L"],
-        now: Prepared,
-        begins: Bool[Tensor, "B 1 1"],
-    ) -> Prepared:
-        """The same for worlds that begin, with what is unsure of where they are by now: a prior of
-        many noises' width cannot tell good ranges from bad."""
-        together = self.known(weight, trust, now, joint.moving(now.fixed))
-        return replace(now, between=torch.where(begins, joint.between(together), now.between))
+        information: Float64[Tensor, "B L L"],
+        inputs: StepInput,
+        first_step: Bool[Tensor, "B 1 1"],
+    ) -> StepInput:
+        """The inputs of worlds at their first step with the variance of the posterior: a prior much
+        wider than the noise cannot tell good ranges from bad."""
+        free = joint.free_indices(inputs.fixed)
+        posterior = self._posterior(weight, information, inputs, free)
+        variance = torch.where(first_step, joint.pair_variance(posterior), inputs.pair_variance)
+        return replace(inputs, pair_variance=variance)
 
-    def slowed(
-        self, belief: SwarmBelief, now: Prepared, y: Float64[Tensor, "B N d"]
+    def _projected(
+        self, belief: SwarmBelief, inputs: StepInput, y: Float64[Tensor, "B N d"]
     ) -> Float64[Tensor, "B N d"]:
-        """Algorithm 1's projection (lines 5–11): nobody moves faster than ``v_max``."""
+        """Algorithm 1's projection (lines 5–11): no velocity is larger than ``v_max``."""
         assert self.v_max is not None
         before = belief.state[..., : self.process.dim]
         reach = self.v_max * elapsed(self.process, belief.step).double().unsqueeze(-1)
-        way = y - before
-        factor = (reach / way.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)
-        held = now.fixed.unsqueeze(-1) | (reach <= 0)
-        return torch.where(held, y, before + factor * way)
+        displacement = y - before
+        length = displacement.norm(dim=-1, keepdim=True)
+        factor = (reach / length.clamp_min(1e-9)).clamp_max(1.0)
+        kept = inputs.fixed.unsqueeze(-1) | (reach <= 0)
+        return torch.where(kept, y, before + factor * displacement)

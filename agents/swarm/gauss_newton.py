@@ -1,4 +1,4 @@
-"""Gauss–Newton on a whole team's ranges: the strong reference that keeps every correlation."""
+"""Gauss–Newton on a whole team's ranges, with all correlations."""
 
 from collections.abc import Callable
 
@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.swarm import delays
-from agents.swarm.joint import held
+from agents.swarm.joint import pin
 from agents.swarm.links import along_links, lengths
 
-Weigh = Callable[
+WeightFunction = Callable[
     [Float64[Tensor, "B N N"]], tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
 ]
 
@@ -40,50 +40,51 @@ def fisher(
 def gauss_newton(
     y: Float64[Tensor, "B N d"],
     distance: Float64[Tensor, "B N N"],
-    weigh: Weigh,
+    weights: WeightFunction,
     fixed: Bool[Tensor, "B N"],
     prior: Float64[Tensor, "B N d"],
     precision: Float64[Tensor, "B K K"],
     iterations: int,
 ) -> tuple[Float64[Tensor, "B N d"], Float64[Tensor, "B N 2"], Float64[Tensor, "B K K"]]:
-    """Positions, the delays (m) that ranges have beyond what is taken off already, and the joint
-    information on both (K = N d + 2 N), from ranges whose weights (1/m²) and shifts (m)
-    ``weigh(residual)`` gives at every iterate, and from a prior with a joint ``precision``. Where
-    that is of positions alone (K = N d) there are no delays. Who is ``fixed`` stays (information
-    1 m⁻², tied to nobody)."""
+    """Positions, the delays (m) left in ranges, and the joint information on both
+    (K = N d + 2 N): x ← x + (Jᵀ W J + Λ)⁻¹ (Jᵀ W r + Λ (m − x)).
+
+    ``weights(residual)`` gives weights W (1/m²) and shifts (m) at every iterate; the ``prior`` m
+    has the joint ``precision`` Λ. Where that is of positions alone (K = N d) there are no delays.
+    Fixed UAVs stay (independent, information 1 m⁻²)."""
     n, d = y.shape[1:]
-    late = y.new_zeros(*y.shape[:2], 2)
+    delay = y.new_zeros(*y.shape[:2], 2)
     delayed = precision.shape[-1] > n * d
-    still = coordinates(fixed, d, precision.shape[-1])
+    pinned = fixed_coordinates(fixed, d, precision.shape[-1])
     matrix = precision
     for _ in range(iterations):
         length = lengths(y)
         residual = distance - length
         if delayed:
-            residual = residual - delays.added(late)
-        weight, shift = weigh(residual)
+            residual = residual - delays.offsets(delay)
+        weight, shift = weights(residual)
         strength = weight * (residual - shift)
-        down, off = along_links(y, strength, length).flatten(1), (prior - y).flatten(1)
+        gradient = along_links(y, strength, length).flatten(1)  # Jᵀ W r
+        to_prior = (prior - y).flatten(1)
         if delayed:
-            push = torch.einsum("bij,rij->bir", strength, delays.ends(y))
-            down, off = (
-                torch.cat((down, push.flatten(1)), -1),
-                torch.cat((off, -late.flatten(1)), -1),
-            )
-        down = down + (precision @ off.unsqueeze(-1))[..., 0]
-        matrix = held(informed(y, weight, delayed) + precision, still)
+            by_delay = torch.einsum("bij,rij->bir", strength, delays.incidence(y))
+            gradient = torch.cat((gradient, by_delay.flatten(1)), -1)
+            to_prior = torch.cat((to_prior, -delay.flatten(1)), -1)
+        gradient = gradient + (precision @ to_prior.unsqueeze(-1))[..., 0]
+        matrix = pin(information_matrix(y, weight, delayed) + precision, pinned)
         factor = torch.linalg.cholesky_ex(matrix).L
-        delta = torch.cholesky_solve(down.masked_fill(still, 0.0).unsqueeze(-1), factor)[..., 0]
+        gradient = gradient.masked_fill(pinned, 0.0).unsqueeze(-1)
+        delta = torch.cholesky_solve(gradient, factor)[..., 0]
         y = y + delta[:, : n * d].unflatten(-1, (n, d))
         if delayed:
-            late = late + delta[:, n * d :].unflatten(-1, (n, 2))
-    return y, late, matrix
+            delay = delay + delta[:, n * d :].unflatten(-1, (n, 2))
+    return y, delay, matrix
 
 
-def informed(
+def information_matrix(
     y: Float64[Tensor, "B N d"], weight: Float64[Tensor, "B N N"], delayed: bool
 ) -> Float64[Tensor, "B K K"]:
-    """The information (1/m²) of ranges on positions and, if they are ``delayed``, on delays."""
+    """The information Jᵀ W J (1/m²) of ranges on positions and, if ``delayed``, on delays."""
     matrix = fisher(y, weight).flatten(3).flatten(1, 2)
     if not delayed:
         return matrix
@@ -92,7 +93,7 @@ def informed(
     return torch.cat((torch.cat((matrix, cross), -1), torch.cat((cross.mT, common), -1)), -2)
 
 
-def coordinates(fixed: Bool[Tensor, "B N"], d: int, size: int) -> Bool[Tensor, "B K"]:
-    """Which of ``size`` unknowns, positions first, are coordinates of who is fixed."""
-    still = fixed.repeat_interleave(d, -1)
-    return torch.nn.functional.pad(still, (0, size - still.shape[-1]))
+def fixed_coordinates(fixed: Bool[Tensor, "B N"], d: int, size: int) -> Bool[Tensor, "B K"]:
+    """Which of ``size`` unknowns, positions first, are coordinates of fixed UAVs."""
+    pinned = fixed.repeat_interleave(d, -1)
+    return torch.nn.functional.pad(pinned, (0, size - pinned.shape[-1]))

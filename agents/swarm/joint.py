@@ -1,64 +1,66 @@
 """The joint covariance of a team's positions: of all components, or of one that stands for all.
 
-A UAV's rows are [e, N e], e = d for all components and e = 1 for one covariance that every axis
-has; then a range of weight W informs each axis by W/d, as links that point everywhere do on average
-(a graph's Laplacian). Who is fixed has nothing in common with anybody.
+A UAV's rows are [e, N e]: e = d for all components, e = 1 for one covariance that all axes share;
+then a range of weight W informs each axis by W/d, as links in all directions do on average (the
+Laplacian of the graph). Fixed UAVs are independent of all others.
 """
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-_NOTHING = 1e-10  # m⁻²: information on a UAV that nothing is known of
+_MIN_INFORMATION = 1e-10  # m⁻²: keeps the matrix regular for a UAV of which nothing is known
 
 
 def independent(variance: Float64[Tensor, "B N"], e: int) -> Float64[Tensor, "B N e K"]:
-    """That of UAVs with nothing in common, from their variances (m²)."""
+    """The joint covariance of independent UAVs, from their variances (m²)."""
     return torch.diag_embed(variance.repeat_interleave(e, -1)).unflatten(1, (-1, e))
 
 
-def carried(
+def predict(
     joint: Float64[Tensor, "B N e K"],
-    kept: Float64[Tensor, "B N"],
-    added: Float64[Tensor, "B N"],
+    factor: Float64[Tensor, "B N"],
+    noise: Float64[Tensor, "B N"],
     fixed: Bool[Tensor, "B N"],
-    spread: float,
+    fix_variance: float,
 ) -> Float64[Tensor, "B N e K"]:
-    """k_i k_j P_ij with ``added`` (m²) on the diagonal; ``spread`` (m²) there of who is fixed."""
+    """P_ij ← f_i f_j P_ij + δ_ij q_i², with ``factor`` f and process ``noise`` q² (m²); fixed UAVs
+    have ``fix_variance`` (m²)."""
     e = joint.shape[2]
-    kept = kept.masked_fill(fixed, 0.0)
-    factor = kept.repeat_interleave(e, -1)
+    factor = factor.masked_fill(fixed, 0.0)
+    factor = factor.repeat_interleave(e, -1)
     after = (factor.unsqueeze(-1) * factor.unsqueeze(-2)) * joint.flatten(1, 2)
-    new = added.masked_fill(fixed, spread).repeat_interleave(e, -1)
-    after.diagonal(dim1=-2, dim2=-1).add_(new)
+    q = noise.masked_fill(fixed, fix_variance).repeat_interleave(e, -1)
+    after.diagonal(dim1=-2, dim2=-1).add_(q)
     return after.view_as(joint)
 
 
-def between(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N N"]:
-    """Variance (m² per axis) of every vector from UAV to UAV."""
+def pair_variance(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N N"]:
+    """Variance P_ii + P_jj − 2 P_ij (m² per axis) of every vector from UAV to UAV."""
     e = joint.shape[2]
     common = joint.unflatten(-1, (-1, e)).diagonal(dim1=2, dim2=4).mean(-1)
     own = common.diagonal(dim1=-2, dim2=-1)
     return (own.unsqueeze(-1) + own.unsqueeze(-2) - 2 * common).clamp_min(0.0)
 
 
-def moving(fixed: Bool[Tensor, "B N"]) -> Int64[Tensor, "M"]:
-    """Who is not fixed in some world at least: the others need no rows where systems are solved."""
+def free_indices(fixed: Bool[Tensor, "B N"]) -> Int64[Tensor, "M"]:
+    """UAVs that are free in some world: the others need no rows in systems of equations."""
     return (~fixed).any(0).nonzero()[:, 0]
 
 
-def among(
+def submatrix(
     joint: Float64[Tensor, "B N e K"], index: Int64[Tensor, "M"]
 ) -> Float64[Tensor, "B M e L"]:
-    """The joint covariance of some."""
+    """The joint covariance of the UAVs in ``index``."""
     e = joint.shape[2]
     return joint[:, index].unflatten(-1, (-1, e))[..., index, :].flatten(-2)
 
 
-def whole(
+def embed(
     part: Float64[Tensor, "B M e L"], index: Int64[Tensor, "M"], variance: Float64[Tensor, "B N"]
 ) -> Float64[Tensor, "B N e K"]:
-    """That of all, from that of some and the ``variance`` (m² per axis) of the others."""
+    """The joint covariance of all, from that of the UAVs in ``index`` and the ``variance`` (m² per
+    axis) of the others, which are independent."""
     if len(index) == variance.shape[-1]:
         return part
     e = part.shape[2]
@@ -69,42 +71,42 @@ def whole(
     return joint
 
 
-def own_blocks(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N e e"]:
+def marginals(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N e e"]:
     """Each UAV's own block."""
     e = joint.shape[2]
     return joint.unflatten(-1, (-1, e)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
 
 
-def variances(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N"]:
+def marginal_variances(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N"]:
     """Each UAV's own variance (m² per axis)."""
-    return own_blocks(joint).diagonal(dim1=-2, dim2=-1).mean(-1)
+    return marginals(joint).diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
-def scaled(
+def rescale(
     joint: Float64[Tensor, "B N e K"], variance: Float64[Tensor, "B N"]
 ) -> Float64[Tensor, "B N e K"]:
     """The same correlations with other variances (m² per axis)."""
     e = joint.shape[2]
-    factor = (variance / variances(joint)).sqrt().repeat_interleave(e, -1)
-    whole = factor.unsqueeze(-1) * factor.unsqueeze(-2) * joint.flatten(1, 2)
-    return whole.view_as(joint)
+    factor = (variance / marginal_variances(joint)).sqrt().repeat_interleave(e, -1)
+    scaled = factor.unsqueeze(-1) * factor.unsqueeze(-2) * joint.flatten(1, 2)
+    return scaled.view_as(joint)
 
 
 def precision(
     joint: Float64[Tensor, "B N e K"], fixed: Bool[Tensor, "B N"]
 ) -> Float64[Tensor, "B K K"]:
-    """The information (1/m²) that it holds on those who are not fixed; 0 for the others."""
-    return held_by(joint.flatten(1, 2), fixed.repeat_interleave(joint.shape[2], -1))
+    """The precision Λ = P⁻¹ (1/m²) of free UAVs; 0 for the fixed ones."""
+    return information_of(joint.flatten(1, 2), fixed.repeat_interleave(joint.shape[2], -1))
 
 
-def held_by(
-    covariance: Float64[Tensor, "B K K"], still: Bool[Tensor, "B K"]
+def information_of(
+    covariance: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]
 ) -> Float64[Tensor, "B K K"]:
-    """The information that a covariance holds on what is not ``still``; 0 on that."""
-    tied = _tied(still)
-    covariance = covariance.masked_fill(tied, 0.0)
-    covariance.diagonal(dim1=-2, dim2=-1).masked_fill_(still, 1.0)
-    return _inverse(covariance).masked_fill(tied, 0.0)
+    """The inverse of a covariance for coordinates that are not ``fixed``; 0 for those that are."""
+    pairs = _fixed_pairs(fixed)
+    covariance = covariance.masked_fill(pairs, 0.0)
+    covariance.diagonal(dim1=-2, dim2=-1).masked_fill_(fixed, 1.0)
+    return _inverse(covariance).masked_fill(pairs, 0.0)
 
 
 def laplacian(
@@ -122,32 +124,33 @@ def posterior(
     fixed: Bool[Tensor, "B N"],
     variance: Float64[Tensor, "B N"],
 ) -> Float64[Tensor, "B N e K"]:
-    """The joint covariance from all information (1/m²), and the ``variance`` of who is fixed."""
+    """The joint covariance by the information (1/m²); fixed UAVs have ``variance`` (m²)."""
     e = information.shape[-1] // fixed.shape[-1]
-    still, known = (each.repeat_interleave(e, -1) for each in (fixed, variance))
-    return left_by(information, still, known).unflatten(1, (-1, e))
+    fixed, variance = (each.repeat_interleave(e, -1) for each in (fixed, variance))
+    return covariance_of(information, fixed, variance).unflatten(1, (-1, e))
 
 
-def left_by(
+def covariance_of(
     information: Float64[Tensor, "B K K"],
-    still: Bool[Tensor, "B K"],
+    fixed: Bool[Tensor, "B K"],
     variance: Float64[Tensor, "B K"],
 ) -> Float64[Tensor, "B K K"]:
-    """The covariance that information leaves, and the ``variance`` (m²) of what is ``still``."""
-    whole = _inverse(held(information, still)).masked_fill(_tied(still), 0.0)
-    whole.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, variance, 0.0))
+    """The inverse of an information matrix; ``fixed`` coordinates have ``variance`` (m²)."""
+    whole = _inverse(pin(information, fixed)).masked_fill(_fixed_pairs(fixed), 0.0)
+    whole.diagonal(dim1=-2, dim2=-1).add_(torch.where(fixed, variance, 0.0))
     return whole
 
 
-def held(matrix: Float64[Tensor, "B K K"], still: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
-    """A matrix of information in which what is ``still`` is tied to nothing and has 1 m⁻²."""
-    matrix = matrix.masked_fill(_tied(still), 0.0)
-    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(still, 1.0, _NOTHING))
+def pin(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
+    """An information matrix whose ``fixed`` coordinates are independent and have 1 m⁻²."""
+    matrix = matrix.masked_fill(_fixed_pairs(fixed), 0.0)
+    least = torch.full_like(fixed, _MIN_INFORMATION, dtype=torch.float32).masked_fill(fixed, 1.0)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(least)
     return matrix
 
 
-def _tied(still: Bool[Tensor, "B K"]) -> Bool[Tensor, "B K K"]:
-    return still.unsqueeze(-1) | still.unsqueeze(-2)
+def _fixed_pairs(fixed: Bool[Tensor, "B K"]) -> Bool[Tensor, "B K K"]:
+    return fixed.unsqueeze(-1) | fixed.unsqueeze(-2)
 
 
 def _inverse(matrix: Float64[Tensor, "B K K"]) -> Float64[Tensor, "B K K"]:

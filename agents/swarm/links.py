@@ -11,14 +11,16 @@ from coloc_env.observation import Observation
 
 @dataclass(frozen=True)
 class Links:
-    """``distance`` [B, N, N] in m (0 where there is none), ``mask`` which were measured."""
+    """Ranges d̃_ij between UAVs: ``distance`` in m (0 where there is none), ``mask``: which were
+    measured."""
 
     distance: Float64[Tensor, "B N N"]
     mask: Bool[Tensor, "B N N"]
 
 
 def links_of(observation: Observation) -> Links:
-    """The links that either end reports, from the leaves of single tags; no number, no link."""
+    """The links that either end reports, in teams with one tag a UAV; without ranges that are not
+    finite."""
     ranges, mask = (x[..., 0, 0] for x in ranges_of(observation, 1))
     return Links(ranges, mask)
 
@@ -37,7 +39,7 @@ def ranges_of(
         index = observation["neighbours"].to(torch.int64)[..., None, None].expand(mask.shape)
         there = torch.zeros(*mask.shape[:2], n, tags, tags, dtype=torch.bool, device=mask.device)
         wide = ranges.new_zeros(there.shape)
-        # An empty slot names UAV 0: what it would write is written where it changes nothing.
+        # An empty slot names UAV 0: its value is written to the diagonal, where it changes nothing.
         own = torch.arange(n, device=mask.device)[:, None, None, None]
         index = torch.where(mask, index, own)
         ranges = wide.scatter(2, index, torch.where(mask, ranges, 0.0))
@@ -55,7 +57,7 @@ def lengths(position: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N N"]:
 
 
 def connected(mask: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N N"]:
-    """Who is in the same connected part of the network, everybody with itself."""
+    """Pairs in the same connected component of the network, each UAV with itself."""
     reach = mask.clone()
     reach.diagonal(dim1=-2, dim2=-1).fill_(True)
     while True:
@@ -79,7 +81,7 @@ def own_information(
     weight: Float64[Tensor, "B N N"],
     length: Float64[Tensor, "B N N"],
 ) -> Float64[Tensor, "B N d d"]:
-    """Σ_j W_ij u_ij u_ijᵀ (1/m²): what links say of a UAV whose neighbours stand still."""
+    """Σ_j W_ij u_ij u_ijᵀ (1/m²): information of links on a UAV whose neighbours are fixed."""
     s = weight / length.square()
     d = y.shape[-1]
     outer = (y.unsqueeze(-1) * y.unsqueeze(-2)).flatten(-2)

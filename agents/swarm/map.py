@@ -1,34 +1,32 @@
-"""References for swarms that keep all correlations of a team: the snapshot's and the recursive one.
-
-Gauss–Newton over the joint position of all UAVs, without a prior (``gn``) and with the joint
-covariance that dead reckoning has carried on (``map``).
-"""
+"""``map``: recursive maximum a posteriori with the team's joint covariance, the reference that
+keeps all correlations."""
 
 from dataclasses import replace
 
 import torch
 
-from agents.swarm import delays, joint
-from agents.swarm.among_anchors import suited
-from agents.swarm.belief import Found, Prepared, SwarmBelief
-from agents.swarm.filter import Confidence
-from agents.swarm.gauss_newton import coordinates
-from agents.swarm.joint_solution import JointSolution
-from agents.swarm.obstruction import unsure
+from agents.swarm import delays as clocks
+from agents.swarm import joint
+from agents.swarm.anchored import supports_anchors
+from agents.swarm.belief import Solution, StepInput, SwarmBelief
+from agents.swarm.confidence import ConfidenceKind
+from agents.swarm.gauss_newton import fixed_coordinates
+from agents.swarm.joint_gauss_newton import JointGaussNewton
+from coloc_env.options import PositiveCount
 from coloc_env.scenario import Believed
 
-_AGAIN = 3  # times that a first step is solved once more
+_FIRST_STEP_REPEATS = 3  # further solutions of a first step
 
 
-@suited
-class RecursiveMap(JointSolution):
+@supports_anchors
+class RecursiveMap(JointGaussNewton):
     """Recursive maximum a posteriori with the team's full covariance. ``confidence``: ``em``,
-    ``huber`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does not
-    estimate what clocks and antennas add to ranges.
+    ``huber``, ``paper`` or ``none``, and ``bias``, as ``dwmds_st`` has them. ``delays=false`` does
+    not estimate what clocks and antennas add to ranges.
 
-    In a swarm's first step ranges are weighed anew by what is unsure of where UAVs are by then: a
-    prior of many noises' width cannot tell good ranges from bad. Few links could agree on a wrong
-    place: where they are not dense, the first weights stay."""
+    In a team's first step ranges are weighted again by the posterior covariance: a prior much wider
+    than the noise cannot tell good ranges from bad. Few links could agree on a wrong place: where
+    they are not dense, the first weights stay."""
 
     name = "map"
 
@@ -36,21 +34,24 @@ class RecursiveMap(JointSolution):
         self,
         believed: Believed,
         *,
-        confidence: Confidence = "em",
-        iterations: int = 3,
+        confidence: ConfidenceKind = "em",
+        iterations: PositiveCount = 3,
         bias: bool = True,
         delays: bool = True,
     ) -> None:
         super().__init__(believed, confidence, iterations, bias, delays)
 
-    def find(self, belief: SwarmBelief, now: Prepared) -> Found:
-        whole = delays.whole(now.joint, now.delays)
-        still = coordinates(now.fixed, self.process.dim, whole.shape[-1])
-        known = joint.held_by(whole, still)
-        found = self.solved(now, known, now.place)
-        begins = (belief.step == 0).any(-1)[:, None, None]
-        for _ in range(_AGAIN if self.dense and bool(begins.any()) else 0):
-            between = torch.where(begins, unsure(now, found), now.between)
-            now = replace(now, between=between)
-            found = self.solved(now, known, torch.where(begins, found.position, now.place))
-        return found
+    def solve(self, belief: SwarmBelief, inputs: StepInput) -> Solution:
+        covariance = clocks.joint_covariance(inputs.joint, inputs.delays)
+        fixed = fixed_coordinates(inputs.fixed, self.process.dim, covariance.shape[-1])
+        precision = joint.information_of(covariance, fixed)  # Λ = P⁻¹
+        solution = self.posterior(inputs, precision, inputs.prior)
+        first_step = (belief.step == 0).any(-1)[:, None, None]
+        for _ in range(_FIRST_STEP_REPEATS if self.dense and bool(first_step.any()) else 0):
+            variance = torch.where(
+                first_step, solution.range_variance(inputs), inputs.pair_variance
+            )
+            inputs = replace(inputs, pair_variance=variance)
+            start = torch.where(first_step, solution.position, inputs.prior)
+            solution = self.posterior(inputs, precision, start)
+        return solution

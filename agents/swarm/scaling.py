@@ -1,7 +1,7 @@
 """Classical multidimensional scaling of whole networks (MDS-MAP).
 
 Shang, Ruml, Zhang & Fromherz, MobiHoc 2003: shortest paths stand for missing distances, classical
-scaling (Torgerson 1952) gives a relative map, and the anchors turn, mirror and shift it.
+scaling (Torgerson 1952) gives a relative map, and a similarity fits it to the anchors.
 """
 
 import torch
@@ -27,7 +27,7 @@ def classical_scaling(paths: Float64[Tensor, "B N N"], dim: int) -> Float64[Tens
     squared = paths.square()
     centred = squared - squared.mean(-1, keepdim=True) - squared.mean(-2, keepdim=True)
     centred = -0.5 * (centred + squared.mean((-2, -1), keepdim=True))
-    missing = max(0, dim - paths.shape[-1])  # of dimensions that a team has too few members for
+    missing = max(0, dim - paths.shape[-1])  # dimensions that a small team does not span
     values, vectors = torch.linalg.eigh(centred)
     values, vectors = (functional.pad(x, (missing, 0)) for x in (values, vectors))
     return vectors[..., -dim:].flip(-1) * values[..., -dim:].flip(-1).clamp_min(0).sqrt().unsqueeze(
@@ -35,16 +35,16 @@ def classical_scaling(paths: Float64[Tensor, "B N N"], dim: int) -> Float64[Tens
     )
 
 
-def aligned(
-    shape: Float64[Tensor, "B N d"],
+def procrustes(
+    points: Float64[Tensor, "B N d"],
     target: Float64[Tensor, "B N d"],
     weight: Float64[Tensor, "B N"],
 ) -> Float64[Tensor, "B N d"]:
-    """``shape`` turned, mirrored, scaled and shifted so that its points come nearest to those of
-    ``target`` that have ``weight`` (Procrustes; Schönemann & Carroll 1970)."""
+    """``points`` rotated, reflected, scaled and translated to the weighted least squares fit of
+    ``target`` (Procrustes; Schönemann & Carroll 1970)."""
     w = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-12)).unsqueeze(-1)
-    from_, to = (w * shape).sum(1, keepdim=True), (w * target).sum(1, keepdim=True)
-    u, s, v = torch.linalg.svd((w * (shape - from_)).mT @ (target - to))
-    spread = (w * (shape - from_).square()).sum((-2, -1)).clamp_min(1e-12)
+    from_, to = (w * points).sum(1, keepdim=True), (w * target).sum(1, keepdim=True)
+    u, s, v = torch.linalg.svd((w * (points - from_)).mT @ (target - to))
+    spread = (w * (points - from_).square()).sum((-2, -1)).clamp_min(1e-12)
     scale = (s.sum(-1) / spread)[:, None, None]
-    return scale * (shape - from_) @ (u @ v) + to
+    return scale * (points - from_) @ (u @ v) + to

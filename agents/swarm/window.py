@@ -1,9 +1,9 @@
-"""The last steps' ranges as further terms of today's stress (ST-DCL paper, section 4.1.1).
+"""Ranges of past steps as further terms of the stress (ST-DCL paper, section 4.1.1).
 
 S(y) = Σ_τ w(τ) Σ_{i<j} W_ij(τ) (d̃_ij(τ) − ‖(y_i − Δ_i(τ)) − (y_j − Δ_j(τ))‖)² (equation 19) with
-w(τ) = exp(−λ (t − τ)) (equation 15) and Δ_i(τ) what dead reckoning says i has moved since τ, so
-that today's positions y remain all that is unknown. What was known before the oldest of these
-steps, and dead reckoning has carried on since, is the prior: no range counts twice.
+w(τ) = exp(−λ (t − τ)) (equation 15) and Δ_i(τ) the displacement of i since τ by dead reckoning, so
+that only the present positions y are unknown. The prior is the one from before the oldest of these
+steps, predicted to the present: no range counts twice.
 """
 
 import torch
@@ -16,124 +16,131 @@ from agents.swarm.links import along_links, lengths
 from agents.tensorclasses import build
 
 
-class History(TensorClass):
-    """The last T steps, the latest first, batch (B, N): where dead reckoning (or a fix) had each
-    UAV before a step's ranges (``place``, m) and its rows of what was then known of all in common
-    (``joint``, m², one covariance for all axes); what it has ``moved`` since (m), and by what
-    factor (``kept``) and with how much variance more (``added``, m²) that knowledge has come down
-    to today; the step's links: what is left of the ranges without their shifts (``distance``, m),
-    how much they count today (``weight``, 1/m²) and how much they tell (``told``, 1/m²)."""
+class RangeWindow(TensorClass):
+    """The last T steps, the latest first, batch (B, N).
 
-    place: Float64[Tensor, "B N T d"]
+    Of each step τ: its ``prior`` of the position (m) and the UAV's rows of the priors' ``joint``
+    covariance P (m², shared by the axes); since then the ``displacement`` Δ(τ) (m) and the
+    prediction f_i f_j P_ij + δ_ij q_i² of the covariance, ``factor`` f and ``noise`` q² (m²); its
+    links: ranges less their shifts (``distance``, m), ``weight`` w(τ) W_ij(τ) (1/m²) and
+    ``information`` (1/m²), faded alike.
+    """
+
+    prior: Float64[Tensor, "B N T d"]
     joint: Float64[Tensor, "B N T N"]
-    moved: Float64[Tensor, "B N T d"]
-    kept: Float64[Tensor, "B N T"]
-    added: Float64[Tensor, "B N T"]
+    displacement: Float64[Tensor, "B N T d"]
+    factor: Float64[Tensor, "B N T"]
+    noise: Float64[Tensor, "B N T"]
     distance: Float64[Tensor, "B N T N"]
     weight: Float64[Tensor, "B N T N"]
-    told: Float64[Tensor, "B N T N"]
+    information: Float64[Tensor, "B N T N"]
 
 
-def begun(
-    place: Float64[Tensor, "B N d"], known: Float64[Tensor, "B N 1 K"], steps: int
-) -> History:
-    """``steps`` steps without ranges, before which as much was ``known`` as now (m²)."""
-    shape = (*place.shape[:2], steps)
-    links = place.new_zeros(*shape, shape[1])
-    rows = known if known.shape[-1] else links[:, :, :1]
-    return History(
-        place=place.unsqueeze(2).repeat(1, 1, steps, 1),
+def empty(
+    prior: Float64[Tensor, "B N d"], covariance: Float64[Tensor, "B N 1 K"], steps: int
+) -> RangeWindow:
+    """``steps`` steps without ranges, all with the present prior (m, m²)."""
+    shape = (*prior.shape[:2], steps)
+    links = prior.new_zeros(*shape, shape[1])
+    rows = covariance if covariance.shape[-1] else links[:, :, :1]
+    return RangeWindow(
+        prior=prior.unsqueeze(2).repeat(1, 1, steps, 1),
         joint=rows.repeat(1, 1, steps, 1),
-        moved=torch.zeros(*shape, place.shape[-1], dtype=place.dtype, device=place.device),
-        kept=place.new_ones(shape),
-        added=place.new_zeros(shape),
+        displacement=prior.new_zeros(*shape, prior.shape[-1]),
+        factor=prior.new_ones(shape),
+        noise=prior.new_zeros(shape),
         distance=links,
         weight=links.clone(),
-        told=links.clone(),
-        batch_size=place.shape[:2],
+        information=links.clone(),
+        batch_size=prior.shape[:2],
     )
 
 
-def carried(
-    past: History,
-    moved: Float64[Tensor, "B N d"],
-    kept: Float64[Tensor, "B N"],
-    added: Float64[Tensor, "B N"],
-    faded: Float64[Tensor, "B 1"],
-) -> History:
-    """A step later, in which everybody ``moved`` (m); knowledge goes on as k_i k_j P_ij with
-    ``added`` (m²) on the diagonal, and ranges count ``faded`` times what they did."""
-    kept, faded = kept.unsqueeze(-1), faded[..., None, None]
+def predict(
+    window: RangeWindow,
+    displacement: Float64[Tensor, "B N d"],
+    factor: Float64[Tensor, "B N"],
+    noise: Float64[Tensor, "B N"],
+    fading: Float64[Tensor, "B 1"],
+) -> RangeWindow:
+    """The window a step later, with the step's displacement (m) by dead reckoning, the ``factor``
+    and process ``noise`` (m²) of the covariance's prediction, and weights faded."""
+    factor, fading = factor.unsqueeze(-1), fading[..., None, None]
     return build(
-        History,
-        past.batch_size,
-        place=past.place,
-        joint=past.joint,
-        moved=past.moved + moved.unsqueeze(2),
-        kept=kept * past.kept,
-        added=kept.square() * past.added + added.unsqueeze(-1),
-        distance=past.distance,
-        weight=faded * past.weight,
-        told=faded * past.told,
+        RangeWindow,
+        window.batch_size,
+        prior=window.prior,
+        joint=window.joint,
+        displacement=window.displacement + displacement.unsqueeze(2),
+        factor=factor * window.factor,
+        noise=factor.square() * window.noise + noise.unsqueeze(-1),
+        distance=window.distance,
+        weight=fading * window.weight,
+        information=fading * window.information,
     )
 
 
-def pushed(
-    past: History,
-    place: Float64[Tensor, "B N d"],
-    known: Float64[Tensor, "B N 1 K"],
+def push(
+    window: RangeWindow,
+    prior: Float64[Tensor, "B N d"],
+    covariance: Float64[Tensor, "B N 1 K"],
     distance: Float64[Tensor, "B N N"],
     weight: Float64[Tensor, "B N N"],
-    told: Float64[Tensor, "B N N"],
-) -> History:
-    """With the step that is now, and without the oldest."""
-    none = torch.zeros_like(place[..., 0])
-    now = {
-        "place": place,
-        "joint": known[:, :, 0],
-        "moved": torch.zeros_like(place),
-        "kept": none + 1,
-        "added": none,
+    information: Float64[Tensor, "B N N"],
+) -> RangeWindow:
+    """The window with the present step in front and without the oldest one."""
+    zero = torch.zeros_like(prior[..., 0])
+    present = {
+        "prior": prior,
+        "joint": covariance[:, :, 0],
+        "displacement": torch.zeros_like(prior),
+        "factor": zero + 1,
+        "noise": zero,
         "distance": distance,
         "weight": weight,
-        "told": told,
+        "information": information,
     }
-    after = {k: torch.cat((x.unsqueeze(2), getattr(past, k)[:, :, :-1]), 2) for k, x in now.items()}
-    return build(History, past.batch_size, **after)
+    steps = {
+        key: torch.cat((new.unsqueeze(2), getattr(window, key)[:, :, :-1]), 2)
+        for key, new in present.items()
+    }
+    return build(RangeWindow, window.batch_size, **steps)
 
 
-def before(past: History) -> tuple[Float64[Tensor, "B N d"], Float64[Tensor, "B N 1 N"]]:
-    """What was known before the oldest step, as carried on to now: places (m) and their covariance
+def oldest_prior(
+    window: RangeWindow,
+) -> tuple[Float64[Tensor, "B N d"], Float64[Tensor, "B N 1 N"]]:
+    """The prior of the oldest step, predicted to the present: positions (m) and their covariance
     (m²). The velocity terms of equation 19 tie the two together."""
-    nobody = torch.zeros_like(past.kept[..., 0], dtype=torch.bool)
-    known = joint.carried(
-        past.joint[:, :, -1:], past.kept[..., -1], past.added[..., -1], nobody, 0.0
+    fixed = torch.zeros_like(window.factor[..., 0], dtype=torch.bool)
+    covariance = joint.predict(
+        window.joint[:, :, -1:], window.factor[..., -1], window.noise[..., -1], fixed, 0.0
     )
-    return past.place[:, :, -1] + past.moved[:, :, -1], known
+    return window.prior[:, :, -1] + window.displacement[:, :, -1], covariance
 
 
-def at(
-    y: Float64[Tensor, "B N d"], past: History
+def _past_positions(
+    y: Float64[Tensor, "B N d"], window: RangeWindow
 ) -> tuple[Float64[Tensor, "B T N d"], Float64[Tensor, "B T N N"]]:
-    """Where everybody was in each step if it is at ``y`` now, and the distances between them."""
-    then = (y.unsqueeze(2) - past.moved).transpose(1, 2)
+    """Positions y − Δ(τ) in each step, and the distances between them (m)."""
+    then = (y.unsqueeze(2) - window.displacement).transpose(1, 2)
     return then, lengths(then.flatten(0, 1)).view(*then.shape[:3], -1)
 
 
-def stress(y: Float64[Tensor, "B N d"], past: History) -> Float64[Tensor, "B"]:
-    """What the last steps add to the stress, in units of ``weight`` · m²."""
-    _, length = at(y, past)
-    residual = past.distance.transpose(1, 2) - length
-    return 0.5 * (past.weight.transpose(1, 2) * residual.square()).sum((1, 2, 3))
+def stress(y: Float64[Tensor, "B N d"], window: RangeWindow) -> Float64[Tensor, "B"]:
+    """The past steps' terms of the stress, in units of ``weight`` · m²."""
+    _, length = _past_positions(y, window)
+    residual = window.distance.transpose(1, 2) - length
+    return 0.5 * (window.weight.transpose(1, 2) * residual.square()).sum((1, 2, 3))
 
 
-def pull(y: Float64[Tensor, "B N d"], past: History) -> Float64[Tensor, "B N d"]:
-    """−½ ∂S/∂y of that."""
-    then, length = at(y, past)
-    strength = past.weight.transpose(1, 2) * (past.distance.transpose(1, 2) - length)
+def descent(y: Float64[Tensor, "B N d"], window: RangeWindow) -> Float64[Tensor, "B N d"]:
+    """−½ ∂S/∂y of the past steps' terms."""
+    then, length = _past_positions(y, window)
+    strength = window.weight.transpose(1, 2) * (window.distance.transpose(1, 2) - length)
     return along_links(then, strength, length).sum(1)
 
 
 def fading(decay: float, dt: Float64[Tensor, "B N"]) -> Float64[Tensor, "B 1"]:
-    """exp(−λ dt), λ in 1/s."""
+    """The factor exp(−λ dt) of w(τ) in a step, λ in 1/s (equation 15)."""
     return torch.exp(-decay * dt[:, :1])

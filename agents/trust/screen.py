@@ -71,7 +71,9 @@ class TrustScreen(Screen):
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         links = sum(self.models[i].count(observation) for i in self.judged)
         size = 1 + MEMORY * links
-        return torch.zeros(*observation.batch_size, size, device=observation.device)
+        return torch.zeros(
+            *observation.batch_size, size, dtype=torch.float32, device=observation.device
+        )
 
     def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Evidence:
         judged = [blocks[i] for i in self.judged]

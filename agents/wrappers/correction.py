@@ -22,31 +22,35 @@ from coloc_env.observation import Observation, prior_action
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
 
-MOST = 1.0  # m: no correction is larger
+_LARGEST = 1.0  # m: no correction is larger, in an arena of up to 100 m
 _PULLS = (AnchorRanges, Heights, UavRangeBearings, UavRanges)  # beside the landmarks' fixes
 
 
-class Based(TensorClass):
+class CorrectionMemory(TensorClass):
     """The base's belief, its estimate as an action, how far an action of 1 moves that (m), and the
     last action; batch (B, N)."""
 
     belief: Any
     estimate: Float32[Tensor, "B N A"]
-    reach: Float32[Tensor, "B N d"]
+    scale: Float32[Tensor, "B N d"]
     last_action: Float32[Tensor, "B N d"]
 
 
 class Correction(ActionMode):
-    """[−1, 1]^d, times 2 (σ + |robust residual|) and at most 1 m an axis, is added to the position
-    that a base localizer estimates; values beyond are cut.
+    """[−1, 1]^d, times what the base may be off, is added to the position that a base localizer
+    estimates (m, world frame); values beyond are cut.
 
-    σ is the base's standard deviation, the robust residual the Huber mean of the landmarks' fixes
-    relative to its estimate (their clipped pull where there are only ranges). ``feedback``: the
-    share of the correction that the base itself is moved by. Leaves: ``base_estimate`` (the base's
-    action), ``base_std``, the landmarks' fixes relative to the base (``landmark_fixes`` …),
-    ``residuals`` (median, Huber mean and scatter of the fixes; pull of the ranges, raw and clipped;
-    the innovation: how far the estimate lies from the last one, moved on at its velocity),
-    ``attitude`` and ``last_action``.
+    What it may be off is 2 (σ + |robust residual|) an axis, at most 1 m or a hundredth of the
+    arena's longest side: σ is the base's standard deviation, the robust residual the Huber mean of
+    the landmarks' fixes relative to its estimate (their clipped pull where there are only ranges).
+    ``feedback``: the share of the correction that the base itself is moved by.
+
+    Leaves: ``base_estimate`` (the base's action), ``base_std`` (m), the landmarks' fixes relative
+    to the base (``landmark_fixes`` …, m), ``residuals`` (m: median, Huber mean and scatter of the
+    fixes; pull of the ranges, raw and clipped; the innovation, how far the estimate lies from the
+    last one moved on at its velocity), ``attitude`` and ``last_action``. A base without a mean
+    state, such as ``map`` or ``cspf``, has no residuals but the innovation, no fixes and no
+    attitude.
     """
 
     name = "correction"
@@ -58,15 +62,22 @@ class Correction(ActionMode):
             raise ValueError(f"feedback={feedback} is not allowed: a share in [0, 1]")
         self.base: Localizer[Any] = make(base, believed)
         kind = type(self.base)
-        if kind.mean is Localizer.mean or (feedback and kind.moved is Localizer.moved):
-            raise ValueError(f"base={base!r} is not allowed: a filter, such as ekf or pf500")
+        if feedback and kind.moved is Localizer.moved:
+            raise ValueError(
+                f"base={base!r} with feedback={feedback} is not allowed: it cannot be moved; "
+                "feedback=0, or a filter such as ekf or pf500"
+            )
         self._base = base
         self.feedback = feedback
-        self.process = make_process(believed)
-        models = make_measurements(believed)
-        self.models = [model for model in models if isinstance(model, _PULLS)]
-        fixes = fix_leaves(believed)
-        self._fixes = fixes if self.process.attitude_error is not None else {}
+        longest = max(b - a for a, b in zip(believed.arena.low, believed.arena.high, strict=True))
+        self._largest = max(_LARGEST, longest / 100)
+        self.models: list[Any] = []
+        self._fixes: dict[str, Leaf] = {}
+        if kind.mean is not Localizer.mean:
+            self.process = make_process(believed)
+            self.models = [m for m in make_measurements(believed) if isinstance(m, _PULLS)]
+            if self.process.attitude_error is not None:
+                self._fixes = fix_leaves(believed)
         mean = ("fix_mean",) if self._fixes else ()
         self.features = ("base_std", *mean, "residuals", "last_action")
 
@@ -88,19 +99,21 @@ class Correction(ActionMode):
             "last_action": Leaf(d, -1.0, 1.0),
         }
 
-    def reset(self, observation: Observation) -> Based:
+    def reset(self, observation: Observation) -> CorrectionMemory:
         estimate = prior_action(observation, self.dim)
         nothing = torch.zeros_like(estimate[..., : self.dim])
-        return Based(
+        return CorrectionMemory(
             belief=self.base.reset(observation),
             estimate=estimate,
-            reach=nothing,
+            scale=nothing,
             last_action=nothing,
             batch_size=estimate.shape[:2],
         )
 
     @torch.no_grad()
-    def observe(self, memory: Based, observation: Observation) -> tuple[Based, Leaves]:
+    def observe(
+        self, memory: CorrectionMemory, observation: Observation
+    ) -> tuple[CorrectionMemory, Leaves]:
         d, dt = self.dim, self.believed.arena.dt
         belief, found = self.base.step(memory.belief, observation)
         estimate = found.action()
@@ -109,13 +122,15 @@ class Correction(ActionMode):
         innovation = position - before[..., :d] - dt * before[..., d : 2 * d]
         leaves: Leaves = {"base_estimate": estimate, "base_std": std}
         residuals, robust = [], torch.zeros_like(position)
-        state = self.base.mean(belief)
+        state = self.base.mean(belief) if self.models or self._fixes else None
         if self.models:
+            assert state is not None
             x, neighbours = state.double(), heard(self.believed, observation)
             blocks = [m.linearize(self.process, x, observation, neighbours) for m in self.models]
             raw, clipped = (pull.to(torch.float32) for pull in pulls(blocks, d))
             residuals, robust = [raw, clipped], clipped
         if self._fixes:
+            assert state is not None
             attitude = self.process.attitude(state).to(torch.float32)
             leaves["attitude"] = attitude
             relative, apart, mask = relative_fixes(self.believed, observation, attitude, position)
@@ -124,14 +139,14 @@ class Correction(ActionMode):
             residuals = [median, robust, scatter, *residuals]
         leaves["residuals"] = torch.cat((*residuals, innovation), -1)
         leaves["last_action"] = memory.last_action
-        reach = (2 * (std + robust.abs())).clamp(max=MOST)
-        return memory.replace(belief=belief, estimate=estimate, reach=reach), leaves
+        scale = (2 * (std + robust.abs())).clamp(max=self._largest)
+        return memory.replace(belief=belief, estimate=estimate, scale=scale), leaves
 
     def estimate(
-        self, memory: Based, action: Float32[Tensor, "B N d"]
-    ) -> tuple[Based, Float32[Tensor, "B N A"]]:
+        self, memory: CorrectionMemory, action: Float32[Tensor, "B N d"]
+    ) -> tuple[CorrectionMemory, Float32[Tensor, "B N A"]]:
         action, d = action.clamp(-1.0, 1.0), self.dim
-        offset = memory.reach * action
+        offset = memory.scale * action
         belief = memory.belief
         if self.feedback:
             belief = self.base.moved(belief, self.feedback * offset)
@@ -139,7 +154,7 @@ class Correction(ActionMode):
         corrected = torch.cat((estimate[..., :d] + offset, estimate[..., d:]), -1)
         return memory.replace(belief=belief, last_action=action), corrected
 
-    def reference(self, memory: Based) -> Float32[Tensor, "B N d"]:
+    def reference(self, memory: CorrectionMemory) -> Float32[Tensor, "B N d"]:
         return memory.estimate[..., : self.dim]
 
 
@@ -163,7 +178,9 @@ Env = TypeVar("Env", bound=Face)
 def with_base(env: Env, base: str = "ekf", feedback: float = 0.0) -> Env:
     """The same environment, whichever face, for corrections on a base localizer's estimates.
 
-    Raises ValueError for a base that is unknown, does not serve the scenario, or has no state.
+    ``base``: any localizer, with options as on the command line (``"ekf:robust=huber"``).
+    Raises ValueError for one that is unknown or does not serve the scenario, and for ``feedback``
+    to one that cannot be moved.
     """
     corrected: Env = env.with_action(Correction(env.scenario.believed, base, feedback))
     return corrected

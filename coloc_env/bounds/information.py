@@ -1,7 +1,7 @@
 """Fisher information of each sensor about its UAVs' poses, at the truth.
 
 Information matrices are over pose errors (δp in m, world; δθ in rad, right: R exp(δθ)), D = 6 in
-space and 3 in the plane. ``truth`` is [B, N, …]; the masks of ``seen`` say which measurements
+space and 3 in the plane. ``truth`` is [B, N, …]; the masks of ``seen`` mark which measurements
 arrived in just this world and step, and their values are never looked at. A modality is one
 function here: ``own_information`` [B, N, D, D] for what one UAV measures of the world, or
 ``shared_information`` [B, N, D, N, D] for what ties two UAVs together.
@@ -33,8 +33,6 @@ from coloc_env.sensors import (
 )
 from coloc_env.sensors.ranging import Tags, tag_positions
 
-SHARED = (Ranging, UavBearings)  # sensors between UAVs
-
 
 @singledispatch
 def own_information(
@@ -62,7 +60,7 @@ def _landmarks(
     """z = Rᵀ(L − p) + N(0, σ² I).
 
     With a fraction ε of false matches, what is seen under a landmark's name is it with probability
-    1 − ε and each other one with ε/(L−1). Which one it was is taken as told: no estimator, not even
+    1 − ε and each other one with ε/(L−1). Which one it was counts as known: no estimator, not even
     one that re-associates, knows more, so the bound holds for all of them. (That of estimators that
     only discard false matches has (1 − ε) times the information.)
     """
@@ -94,10 +92,10 @@ def _anchor_ranging(
     tags, jacobian = _tags(truth, sensor.tags)
     toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
     rows = toward @ jacobian  # [B, N, T, A, D]
-    told = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
+    each = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
     if sensor.blocked:
-        told[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
-    weights = arrived * told
+        each[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
+    weights = arrived * each
     return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
 
 
@@ -137,11 +135,11 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
     links = links.flatten(1, 2).flatten(2, 3)
     tags, jacobian = _tags(truth, sensor.tags)
     points = tags.flatten(1, 2)
-    told = torch.full_like(links, range_information(sensor.noise))
+    each = torch.full_like(links, range_information(sensor.noise))
     if sensor.walls:
         blocked = depth(points.unsqueeze(2), points.unsqueeze(1), sensor.walls) > 0
-        told[blocked] = range_information(replace(sensor.noise, nlos=1.0))
-    links = torch.maximum(links, links.transpose(1, 2)) * told
+        each[blocked] = range_information(replace(sensor.noise, nlos=1.0))
+    links = torch.maximum(links, links.transpose(1, 2)) * each
     along = _unit(points.unsqueeze(2) - points.unsqueeze(1))
     weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)
     laplacian = -weights

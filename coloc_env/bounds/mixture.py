@@ -21,8 +21,8 @@ def range_information(noise: RangeNoise) -> float:
 
     The range is distance + error, so this is the information about the distance (Kay 1993, p. 58);
     for Gaussian noise it is 1/σ². No estimator extracts more from a mixture, and one range alone
-    gives less: which ranges are outliers has to be told from the others. Where NLOS lasts
-    (``nlos_time``) the ranges before tell much of that: which are NLOS is then taken as known.
+    gives less: which ranges are outliers is not known. Where NLOS lasts
+    (``nlos_time``) the ranges before show much of that: which are NLOS is then taken as known.
     """
     if noise.nlos_time is not None:
         known = (replace(noise, nlos=share, nlos_time=None) for share in (0.0, 1.0))

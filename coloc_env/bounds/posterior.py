@@ -15,18 +15,18 @@ taken at the truth. The expectation is over what the past leaves open (condition
 Varshney, IEEE Trans. Signal Processing 59(1), 2011): states spread by (J⁻)⁻¹ about an estimate that
 is itself so spread about the truth, hence the truth moved by N(0, 2 (J⁻)⁻¹). One antithetic pair of
 draws a step, functions of seed and step, stands for it. At the truth alone there would be no bound
-while the posterior is broad: in a level formation ranges would tell nothing of heights, though they
+while the posterior is broad: in a level formation ranges would hold nothing on heights, though they
 rule out large errors.
 
 - For linear Gaussian models it is exact and attained. Else it holds as far as the posterior is near
   a Gaussian of covariance J⁻¹, and is tight once that is small against distances and a radian.
 - Of noise that is not Gaussian only the Fisher information enters: the bound holds, but a filter
-  with few measurements per step does not reach it. Which ranges are NLOS is told where that lasts.
+  with few measurements per step does not reach it. Which ranges are NLOS is known where that lasts.
 - IMU, INS and odometry noise, of known statistics, is process noise. With ``ConstantVelocity`` the
   process noise is the model's: scripted motion is smoother, and a filter may do better than that.
-- What visibility itself tells of the position is left out; a delayed measurement counts as if made
-  when it arrives; which landmark a false match shows is told (see ``information``); a uniform prior
-  is taken as a Gaussian (see ``process``).
+- The information that visibility itself holds is left out; a delayed measurement counts as if made
+  when it arrives; the landmark that a false match shows is known (see ``information``); a uniform
+  prior is taken as a Gaussian (see ``process``).
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,6 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.bounds.expected import expected_information
-from coloc_env.bounds.information import SHARED
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
 from coloc_env.bounds.worlds import seeds_of, worlds
@@ -113,7 +112,7 @@ def _bound(
     pose, dim = model.pose(), scenario.arena.dim
     n = scenario.arena.n_uavs if cooperative else 1
     states = (len(seeds), scenario.arena.n_uavs, pose.shape[1])
-    sensors = [s for s in true_sensors(scenario) if cooperative or not isinstance(s, SHARED)]
+    sensors = [s for s in true_sensors(scenario) if cooperative or not s.between_uavs]
     prior = torch.block_diag(*n * [prior_covariance(model, scenario)])
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
     before: Kinematics | None = None

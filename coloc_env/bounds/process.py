@@ -18,7 +18,7 @@ from coloc_env.geometry import cross_matrix, rotation_between, rotation_matrix, 
 from coloc_env.motion import Kinematics
 from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
-from coloc_env.sensors.base import Recorded
+from coloc_env.sensors.base import RecordedSensor
 
 Jacobians = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B N E E"]]
 S = TypeVar("S", bound=Sensor)
@@ -122,9 +122,14 @@ class InsErrors(ErrorModel):
         if self.ins.bias:
             f = torch.tensor(((1.0, -kept * self.dt), (0.0, kept)), dtype=torch.float64)
             push = torch.tensor((-self.dt, 1.0), dtype=torch.float64)
-            q = fresh * push.outer(push) + white * torch.tensor(((1, 0), (0, 0))).double()
+            q = fresh * push.outer(push) + white * torch.tensor(
+                ((1.0, 0.0), (0.0, 0.0)), dtype=torch.float64
+            )
         else:
-            f, q = torch.ones(1, 1).double(), torch.full((1, 1), white).double()
+            f, q = (
+                torch.ones(1, 1).double(),
+                torch.full((1, 1), white, dtype=torch.float32).double(),
+            )
         axes = torch.eye(self.dim, dtype=torch.float64)
         f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
         shape = (*now.position.shape[:2], *f.shape)
@@ -154,7 +159,10 @@ class ConstantVelocityErrors(ErrorModel):
         shape = (*now.position.shape[:2], 2 * self.dim, 2 * self.dim)
         f, q = discretise(system, drive, self.dt)
         if self.process.held:
-            gain = self.process.accel_std * torch.tensor((0.5 * self.dt**2, self.dt)).double()
+            gain = (
+                self.process.accel_std
+                * torch.tensor((0.5 * self.dt**2, self.dt), dtype=torch.float32).double()
+            )
             q = gain.outer(gain)
         f, q = (torch.kron(x, axes).to(now.position) for x in (f, q))
         return f.expand(shape), q.expand(shape)
@@ -196,8 +204,8 @@ def prior_covariance(model: ErrorModel, scenario: Scenario) -> Float64[Tensor, "
 
 
 def true_sensors(scenario: Scenario) -> list[Sensor]:
-    """What measures truly; of a recording, the sensor its tape is described by."""
-    return [s.sensor if isinstance(s, Recorded) else s for s in scenario.sensors]
+    """What measures truly; of a recording, the sensor that describes its leaves."""
+    return [s.sensor if isinstance(s, RecordedSensor) else s for s in scenario.sensors]
 
 
 def strapdown_jacobians(

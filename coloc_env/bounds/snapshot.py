@@ -1,11 +1,11 @@
-"""The Cramér–Rao bound of a snapshot: what one step's measurements alone say of the positions.
+"""The Cramér–Rao bound of a snapshot: the information in one step's measurements alone.
 
     J = Σ Hᵀ R⁻¹ H      E ‖p̂_i − p_i‖² ≥ tr (J⁻¹)_ii
 
 for every unbiased estimator (Kay, "Fundamentals of Statistical Signal Processing: Estimation
 Theory", 1993, section 3.7), with no prior, no motion and nothing of the steps before. J is over the
 poses of the whole team, at the truth; for noise that is not Gaussian it is the mixture's (see
-``mixture``). A UAV that is told its position has that as a measurement, with its noise. Attitude is
+``mixture``). A UAV that is given its position has it as a measurement, with its noise. Attitude is
 unknown only where the posterior bound has it among its states (see ``process``).
 
 **Who is localizable.** Where J is singular its null space holds the motions that no measurement
@@ -17,7 +17,7 @@ units of what it would know of them if it knew all the others', so that no unit 
 Parts of the team without a link between them are blocks of J and do not touch each other.
 
 - It is local: a UAV with ranges to three anchors counts as localizable, though its mirror image in
-  their plane explains them as well. An estimator that starts anywhere is told no such thing.
+  their plane explains them as well. An estimator that starts anywhere knows no better.
 - A geometry that is nearly singular has a finite bound of any size; beyond 10⁶ times those units
   it counts as singular.
 """
@@ -151,7 +151,7 @@ def _pose(model: ErrorModel) -> Float64[Tensor, "D P"]:
 
 
 def _in_itself(sensor: Sensor) -> Sensor:
-    """A sensor of which the steps before tell nothing: not which ranges are NLOS for long."""
+    """The sensor without what earlier steps show: which ranges are NLOS for long."""
     if isinstance(sensor, Ranging | AnchorRanging):
         return replace(sensor, noise=replace(sensor.noise, nlos_time=None))
     return sensor

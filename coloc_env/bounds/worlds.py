@@ -35,7 +35,9 @@ def worlds(
     """Truth, observation and who is scored, step by step."""
     world = World(scenario, len(seeds))
     seen = world.reset(seeds)
-    idle = torch.zeros(len(seeds), scenario.arena.n_uavs, action_width(scenario))
+    idle = torch.zeros(
+        len(seeds), scenario.arena.n_uavs, action_width(scenario), dtype=torch.float32
+    )
     for _ in range(steps):
         yield world.truth, seen, world.score(idle)[1]
         world.advance(idle)

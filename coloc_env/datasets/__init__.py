@@ -9,12 +9,12 @@ from typing import Any
 
 from coloc_env.datasets import euroc, hanyang, miluv, mrclam, murp, tiers, tuc
 from coloc_env.datasets.euroc import load_euroc
-from coloc_env.datasets.files import DataError, data_root, dataset_folder
+from coloc_env.datasets.folders import data_root, dataset_folder, entries
 from coloc_env.datasets.hanyang import load_hanyang
 from coloc_env.datasets.miluv import load_miluv
 from coloc_env.datasets.mrclam import load_mrclam
 from coloc_env.datasets.murp import load_murp
-from coloc_env.datasets.recording import Recording, Table, Track
+from coloc_env.datasets.recording import DataError, Recording, Table, Track, near_origin
 from coloc_env.datasets.tiers import load_tiers
 from coloc_env.datasets.tuc import load_tuc
 
@@ -46,10 +46,10 @@ class _Dataset:
 
 
 def _folders(robots_in: Callable[[Path], tuple[Any, ...]]) -> Callable[[Path], dict[str, int]]:
-    """A folder per sequence, which ``robots_in`` tells from others."""
+    """A folder per sequence, in which ``robots_in`` finds robots."""
 
     def sequences_in(home: Path) -> dict[str, int]:
-        folders = sorted(path for path in home.iterdir() if path.is_dir())
+        folders = [path for path in entries(home) if path.is_dir()]
         robots = {folder.name: len(robots_in(folder)) for folder in folders}
         return {name: count for name, count in robots.items() if count}
 
@@ -74,7 +74,7 @@ def load(
     data: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Recording:
-    """Load a recording found in the data folder.
+    """Load a recording found in the data folder, about an origin of its own (``near_origin``).
 
     Args:
         name: one of DATASETS.
@@ -96,10 +96,10 @@ def load(
             raise DataError(f"no sequence {each!r} in {folder}, there are: {known}")
     loader = _DATASETS[name].load
     if name == "euroc":
-        return loader([folder / each for each in wanted], **options)
+        return near_origin(loader([folder / each for each in wanted], **options))
     if len(wanted) != 1:
         raise DataError(f"{name} is loaded one sequence at a time, not {sequence}")
-    return loader(folder / wanted[0], **options)
+    return near_origin(loader(folder / wanted[0], **options))
 
 
 def sequences(name: str, data: str | os.PathLike[str] | None = None) -> tuple[str, ...]:

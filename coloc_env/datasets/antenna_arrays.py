@@ -8,7 +8,7 @@ from torch import Tensor
 
 from coloc_env.geometry import Se3, concat, cross_matrix, quaternion_matrix
 
-_HEADINGS = 4  # of the other array that Gauss–Newton is begun with
+_HEADINGS = 4  # of the other array that Gauss–Newton starts from
 _ROUNDS = (5, 10)  # of Gauss–Newton from all of them, and from the best
 _CAUCHY = 2.4  # standard deviations at which a range counts half as much (95 % efficient)
 
@@ -25,9 +25,9 @@ def relative_poses(
     """Poses T of one array (second ``arms``) in the body frame of another (first), and their
     covariances in the tangent [ρ, φ] at T, from K sets of ranges r_ij = ‖T b_j − a_i‖ + noise.
 
-    Arrays in the plane z = 0 of their bodies cannot tell which side of that plane the other is on:
+    Arrays in the plane z = 0 of their bodies do not show which side of that plane the other is on:
     T and its mirror image M T M, M = diag(1, 1, −1), have the very same ranges; and of an array
-    near the plane, neither its height nor how both are tilted shows. So two things more are told:
+    near the plane, neither its height nor how both are tilted shows. So two things more are given:
     how far ``above`` the first the second is (m, with ``above_std``), and that both are level
     within ``tilt_std`` rad. Ranges that do not fit count less (Cauchy's weights, ``std`` in m).
 
@@ -35,19 +35,19 @@ def relative_poses(
     four headings about the one that they suggest; the pose that fits best is returned.
     """
     own, other = arms
-    told = ranges, there, own, other, std, above, above_std, tilt_std
+    given = ranges, there, own, other, std, above, above_std, tilt_std
     start = _starts(ranges, there, own, other, above)
-    found = [_descended(pose, told, _ROUNDS[0]) for pose in start.unbind(1)]
-    costs = torch.stack([_normal_equations(pose, *told)[2] for pose in found])
+    found = [_descended(pose, given, _ROUNDS[0]) for pose in start.unbind(1)]
+    costs = torch.stack([_normal_equations(pose, *given)[2] for pose in found])
     best = costs.argmin(0).view(1, -1, 1).expand(1, -1, 7)
-    pose = _descended(torch.stack(found).gather(0, best)[0], told, _ROUNDS[1])
-    return pose, torch.linalg.inv(_normal_equations(pose, *told)[0])
+    pose = _descended(torch.stack(found).gather(0, best)[0], given, _ROUNDS[1])
+    return pose, torch.linalg.inv(_normal_equations(pose, *given)[0])
 
 
-def _descended(pose: Float64[Tensor, "K 7"], told: tuple, rounds: int) -> Float64[Tensor, "K 7"]:
+def _descended(pose: Float64[Tensor, "K 7"], given: tuple, rounds: int) -> Float64[Tensor, "K 7"]:
     """The pose after some Gauss–Newton steps."""
     for _ in range(rounds):
-        information, gradient, _ = _normal_equations(pose, *told)
+        information, gradient, _ = _normal_equations(pose, *given)
         pose = Se3.plus(pose, torch.linalg.solve(information, gradient.unsqueeze(-1))[..., 0])
     return pose
 
@@ -80,7 +80,7 @@ def _normal_equations(
     weighted = flat * weight.flatten(1).unsqueeze(-1)
     information = weighted.mT @ flat
     gradient = (weighted.mT @ residual.flatten(1).unsqueeze(-1))[..., 0]
-    # Told beside the ranges: the height, and where the other's z axis points, R e_z = e_z.
+    # Given beside the ranges: the height, and where the other's z axis points, R e_z = e_z.
     axis = pose.new_tensor((0.0, 0.0, 1.0))
     raised = concat((rotation[:, 2], torch.zeros_like(rotation[:, 2]))).unsqueeze(1) / above_std
     tilted = (-rotation @ cross_matrix(axis))[:, :2] / tilt_std
@@ -113,7 +113,7 @@ def _starts(
     back = bearing(missing.nanmedian(1).values, other)
     flat = (middle.square() - above.square()).clamp_min(0.01).sqrt()
     heading = (seen - back + math.pi).unsqueeze(-1)
-    heading = heading + torch.arange(_HEADINGS) * (2 * math.pi / _HEADINGS)
+    heading = heading + torch.arange(_HEADINGS, dtype=torch.float32) * (2 * math.pi / _HEADINGS)
     position = torch.stack((flat * seen.cos(), flat * seen.sin(), above), -1)
     zero = torch.zeros_like(heading)
     attitude = torch.stack(((0.5 * heading).cos(), zero, zero, (0.5 * heading).sin()), -1)

@@ -1,4 +1,4 @@
-"""EuRoC MAV: IMU and full-state truth; sequences of one room, flown "together" as a team."""
+"""EuRoC MAV: IMU and full-state truth; sequences of one room, replayed "together" as a team."""
 
 import os
 from collections.abc import Iterable
@@ -6,8 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
-from coloc_env.datasets.recording import IMU_COLUMNS, Recording, Table, Track, one_hemisphere
+from coloc_env.datasets.files import FileFormat, Rows, distinct, fail, read
+from coloc_env.datasets.recording import (
+    IMU_COLUMNS,
+    DataError,
+    Recording,
+    Table,
+    Track,
+    one_hemisphere,
+)
 
 SOURCE = (
     "EuRoC MAV; Burri, Nikolic, Gohl, Schneider, Rehder, Omari, Achtelik, Siegwart, "
@@ -39,7 +46,7 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     A folder holds ``imu0.csv`` and ``groundtruth.csv``, or is laid out as ETH publishes it
     (``mav0/imu0/data.csv``, ``mav0/state_groundtruth_estimate0/data.csv``). Time zero of each
     sequence is its own first truth; IMU samples before it have negative times. The body frame is
-    the IMU's with the axes named anew (z, -y, x become forward, left, up), for IMU, attitude and
+    the IMU's with the axes renamed (z, -y, x become forward, left, up), for IMU, attitude and
     biases alike; "forward" points 22 degrees below the horizon in level flight, as the camera
     does. The truth (200 Hz, but 20 Hz in OpenVINS's V1_01_easy) is itself a batch estimate that
     used the IMU. Stream: imu.
@@ -57,7 +64,7 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
     names = tuple(path.name for path in paths)
     if len(set(map(room, names))) != 1 or len(set(names)) != len(names):
         given = ", ".join(names) or "none"
-        raise DataError(f"a EuRoC team is made of different sequences of one room, not {given}")
+        raise DataError(f"a EuRoC team consists of different sequences of one room, not {given}")
     tracks, tables = zip(*map(_sequence, paths), strict=True)
     return Recording(
         name="euroc/" + "+".join(names),
@@ -73,12 +80,13 @@ def load_euroc(folders: str | os.PathLike[str] | Iterable[str | os.PathLike[str]
 
 
 def robots_in(folder: Path) -> tuple[str, ...]:
-    """The one robot of a sequence, which is called like it."""
-    return (folder.name,) if _truth_file(folder).is_file() else ()
+    """The one robot of a sequence, which is called like it; its files may be incomplete."""
+    files = (_truth_file(folder), _imu_file(folder))
+    return (folder.name,) if any(file.is_file() for file in files) else ()
 
 
 def room(sequence: str) -> str:
-    """The room a sequence was flown in: the part of its name before the first ``_``."""
+    """The room a sequence was recorded in: the part of its name before the first ``_``."""
     return sequence.split("_")[0]
 
 
@@ -88,13 +96,17 @@ def _sequence(folder: Path) -> tuple[Track, Table]:
     length = np.linalg.norm(truth.values[:, 3:7], axis=1)
     if (bad := np.abs(length - 1) > 0.01).any():
         fail(path, _TRUTH, bad, f"the quaternion has length {length[bad][0]:.3f}, not 1")
-    imu = read(_either(folder, "mav0/imu0/data.csv", "imu0.csv"), _IMU)
+    imu = read(_imu_file(folder), _IMU)
     turned = np.concatenate((imu.values[:, :3] @ _TO_BODY.T, imu.values[:, 3:] @ _TO_BODY.T), 1)
     return _track(truth), Table(imu.time - truth.time[0], turned, IMU_COLUMNS)
 
 
 def _truth_file(folder: Path) -> Path:
     return _either(folder, "mav0/state_groundtruth_estimate0/data.csv", "groundtruth.csv")
+
+
+def _imu_file(folder: Path) -> Path:
+    return _either(folder, "mav0/imu0/data.csv", "imu0.csv")
 
 
 def _either(folder: Path, published: str, plain: str) -> Path:

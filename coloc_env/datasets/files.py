@@ -1,7 +1,8 @@
-"""Where recordings lie, and reading their text files: fast, checked, and cached on disk."""
+"""Reading recordings' text files: fast, checked, and cached on disk."""
 
 import contextlib
 import csv
+import decimal
 import hashlib
 import os
 import tempfile
@@ -10,73 +11,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NamedTuple, NoReturn, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_env.datasets.recording import Flags, Floats, Stamps
+from coloc_env.datasets.recording import DataError, Flags, Floats, Stamps
 
-HOMES = {
-    "mrclam": "http://asrl.utias.utoronto.ca/datasets/mrclam/",
-    "euroc": "https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets",
-    "miluv": "https://github.com/decargroup/miluv",
-    "tuc": "https://github.com/TUC-ProAut/libRSF",
-    "hanyang": "https://doi.org/10.5281/zenodo.15226105",
-    "tiers": "https://github.com/TIERS/uwb-cooperative-mrs-localization",
-    "murp": "https://github.com/mit-acl/murp-datasets",
-}
-_FOLDERS = {  # where not the name
-    "tuc": "tuc_indoor_uwb",
-    "hanyang": "hanyang_outdoor_uwb",
-    "tiers": "tiers_mrs",
-    "murp": "murp/parsed",
-}
-_CACHE_VERSION = 1
-
-
-class DataError(ValueError):
-    """Recorded data that are missing or not what they should be; one line that says where."""
-
-
-def data_root(data: str | os.PathLike[str] | None = None) -> Path:
-    """The folder that holds one folder per dataset.
-
-    Args:
-        data: the folder; by default the environment variable COLOC_DATA, else ``../shared/data``
-            from the root of a checkout of the project.
-
-    Raises:
-        DataError: there is no such folder.
-    """
-    chosen = data or os.environ.get("COLOC_DATA")
-    checkout = Path(__file__).resolve().parents[2]
-    if chosen:
-        root = Path(chosen).expanduser()
-    elif (checkout / "pyproject.toml").is_file():
-        root = checkout.parent / "shared" / "data"
-    else:
-        raise DataError(f"no folder of recordings is known: {_remedy(*HOMES)}")
-    if not root.is_dir():
-        raise DataError(f"no folder of recordings {root}: {_remedy(*HOMES)}")
-    return root
-
-
-def dataset_folder(name: str, data: str | os.PathLike[str] | None = None) -> Path:
-    """The folder of dataset ``name`` in :func:`data_root`.
-
-    Raises:
-        DataError: there is no such folder.
-    """
-    folder = data_root(data) / _FOLDERS.get(name, name)
-    if not folder.is_dir():
-        raise DataError(f"no recordings in {folder}: {_remedy(name)}")
-    return folder
-
-
-def _remedy(*names: str) -> str:
-    homes = ", ".join(f"{_FOLDERS.get(name, name)}/ (from {HOMES[name]})" for name in names)
-    return f"set COLOC_DATA or --data to the folder that holds {homes}"
+_CACHE_VERSION = 2
+_MOST = 1e9  # of anything recorded, in any unit
+_STAMP = 48  # characters of a stamp
 
 
 @dataclass(frozen=True)
@@ -93,7 +37,8 @@ class FileFormat:
             stamp is ``stamp_column``. Otherwise ``#`` starts a comment.
         whole: those of ``columns`` that hold whole numbers.
         stamp_column: the stamp's name in a header.
-        optional: those of ``columns`` that may be empty, which reads as NaN; only with ``header``.
+        optional: those of ``columns`` in which a sample may be missing: empty (with a delimiter),
+            which reads as NaN, or not finite; what is beyond all measure reads as infinity.
         words: every line begins with one of these words, and those with the first are the rows;
             none: all lines are rows, and begin with their stamp.
     """
@@ -120,26 +65,33 @@ class Rows(NamedTuple):
     values: Floats
 
 
-def read(path: Path, form: FileFormat) -> Rows:
+def read(path: Path, form: FileFormat, *, empty: bool = False) -> Rows:
     """Parse a text file, or take what an earlier call parsed from the cache.
+
+    Marks of byte order, line ends of any system, blank lines and bytes that are not UTF-8 in what
+    is not read are no fault. Stamps are rounded to the nanosecond. ``empty``: it may have no rows.
 
     The cache holds one ``.npz`` per file and format, in the folder COLOC_CACHE or else ``coloc``
     in the user's cache folder; it is renewed when the file's size or modification time change.
 
     Raises:
-        DataError: the file is missing, empty, truncated, of another kind, holds something that
-            is no finite number, or its times decrease; with its name and the line.
+        DataError: the file is missing, empty, truncated, of another kind, holds something that is
+            no number up to 1e9, or its times decrease; with its name and the line.
     """
     try:
         status = path.stat()
     except OSError:
         raise DataError(f"{path}: no such file") from None
     version = np.array([status.st_size, status.st_mtime_ns, _CACHE_VERSION])
-    entry = _cache_folder() / f"{_digest(f'{path.resolve()} {form}')}.npz"
-    rows = _cached(entry, version, len(form.columns))
+    folder = _cache_folder()
+    entry = None if folder is None else folder / f"{_digest(f'{path.resolve()} {form}')}.npz"
+    rows = None if entry is None else _cached(entry, version, len(form.columns))
     if rows is None:
         rows = _parse(path, form)
-        _store(entry, version, rows)
+        if entry is not None:
+            _store(entry, version, rows)
+    if not len(rows.time) and not empty:
+        raise DataError(f"{path}: no data")
     return rows
 
 
@@ -162,19 +114,19 @@ def _parse(path: Path, form: FileFormat) -> Rows:
         raise
     except ValueError as error:
         _explain(path, form, error)
-    if not len(table):
-        raise DataError(f"{path}: no data")
     for name in form.columns:
         column = table[name]
-        finite = np.isfinite(column)
+        sane = np.abs(column) <= _MOST
         if name in form.optional:
-            finite |= np.isnan(column)
-        if not finite.all():
-            fail(path, form, ~finite, f"{name} is not a finite number")
+            column[np.abs(column) > _MOST] = np.inf
+        elif (bad := ~np.isfinite(column)).any():
+            fail(path, form, bad, f"{name} is not a finite number")
+        elif not sane.all():
+            fail(path, form, ~sane, f"{name} is {column[~sane][0]:g}, beyond {_MOST:g}")
         if name in form.whole and (broken := column != np.rint(column)).any():
             fail(path, form, broken, f"{name} is {column[broken][0]:g}, not a whole number")
     time = _time(path, form, table)
-    if (back := np.diff(time, prepend=time[0]) < 0).any():
+    if (back := np.diff(time, prepend=time[:1]) < 0).any():
         fail(path, form, back, "the time is before that of the line above")
     return Rows(time, np.stack([table[name] for name in form.columns], -1))
 
@@ -182,30 +134,35 @@ def _parse(path: Path, form: FileFormat) -> Rows:
 def _load(path: Path, form: FileFormat) -> NDArray[np.void]:
     """Every column of the file, those not wanted cut to a byte, so that all rows are checked."""
     kinds = dict.fromkeys(form.columns, "f8")
-    kinds[form.stamp_column] = "f8" if form.stamp == "relative seconds" else "S32"
+    kinds[form.stamp_column] = "f8" if form.stamp == "relative seconds" else f"S{_STAMP}"
     names = _names(path, form)
-    with warnings.catch_warnings():
+    may_be_empty = form.optional if form.delimiter else ()
+    with warnings.catch_warnings(), _text(path) as file:
         warnings.filterwarnings("ignore", ".*contained no data", UserWarning)
         return np.loadtxt(
-            list(_marked(path, form)) if form.words else path,
+            list(_marked(path, form)) if form.words else file,
             dtype=[(name or f"column {i}", kinds.get(name, "S1")) for i, name in enumerate(names)],
-            converters={i: _optional for i, name in enumerate(names) if name in form.optional},
+            converters={i: _optional for i, name in enumerate(names) if name in may_be_empty},
             comments=None if form.header else "#",
             delimiter=form.delimiter,
             skiprows=int(form.header),
             quotechar='"' if form.header else None,
-            encoding="utf-8",
             ndmin=1,
         )
 
 
+def _text(path: Path) -> TextIO:
+    """The file as text without a mark of byte order; what is not UTF-8 is replaced."""
+    return path.open(encoding="utf-8-sig", errors="replace")
+
+
 def _optional(field: str) -> float:
-    return float(field) if field else np.nan
+    return float(field) if field.strip() else np.nan
 
 
 def _marked(path: Path, form: FileFormat) -> Iterator[str]:
     """The lines that begin with the format's first word."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with _text(path) as file:
         for number, line in enumerate(file, 1):
             word = next(iter(line.split("#")[0].split()), None)
             if word is not None and word not in form.words:
@@ -223,7 +180,7 @@ def _names(path: Path, form: FileFormat) -> list[str]:
 
 
 def _header(path: Path, form: FileFormat) -> list[str]:
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with _text(path) as file:
         names = next(csv.reader(file), None)
     if names is None:
         raise DataError(f"{path}: no data")
@@ -235,7 +192,7 @@ def _header(path: Path, form: FileFormat) -> list[str]:
 
 def _time(path: Path, form: FileFormat, table: NDArray[np.void]) -> Stamps:
     """Nanoseconds; stamps since 1970 from their decimal text, since a float would round them."""
-    if form.stamp is None:
+    if form.stamp is None or not len(table):
         return np.zeros(len(table), np.int64)
     stamp = table[form.stamp_column]
     if form.stamp == "relative seconds":
@@ -243,32 +200,43 @@ def _time(path: Path, form: FileFormat, table: NDArray[np.void]) -> Stamps:
         if bad.any():
             fail(path, form, bad, f"the time is {stamp[bad][0]:g}, not {form.stamp}")
         return np.rint(1e9 * stamp).astype(np.int64)
-    plain, power, rest = np.strings.partition(stamp, np.bytes_(b"e+18"))
-    digits, point, fraction = np.strings.partition(plain, np.bytes_(b"."))
-    powered = np.strings.str_len(power) > 0
-    bad = np.strings.str_len(rest) > 0
+    digits, point, fraction = np.strings.partition(stamp, np.bytes_(b"."))
     if form.stamp == "seconds":
-        bad |= powered | (np.strings.str_len(fraction) > 9)
+        plain = np.strings.isdigit(digits) & (np.strings.str_len(fraction) <= 9)
         digits = np.strings.add(digits, np.strings.ljust(fraction, 9, np.bytes_(b"0")))
     else:
-        bad |= (np.strings.str_len(point) > 0) & ~powered
-        bad |= (np.strings.str_len(digits) > 1) & powered
-        decimals = np.strings.ljust(fraction, 18, np.bytes_(b"0"))
-        digits = np.where(powered, np.strings.add(digits, decimals), digits)
+        plain = np.strings.str_len(point) == 0
     length = np.strings.str_len(digits)
-    bad |= ~np.strings.isdigit(digits) | (length > 19) | ((length == 19) & (digits >= b"9"))
-    if bad.any():
+    plain &= np.strings.isdigit(digits) & ((length < 19) | ((length == 19) & (digits < b"9")))
+    nanoseconds = np.where(plain, digits, b"0").astype(np.int64)
+    for i in np.flatnonzero(~plain):
+        nanoseconds[i] = _nanoseconds(stamp[i], 9 if form.stamp == "seconds" else 0)
+    if (bad := nanoseconds < 0).any():
         shown = stamp[bad][0].decode(errors="replace")
         fail(path, form, bad, f"the time is {shown}, not {form.stamp} since 1970")
-    return digits.astype(np.int64)
+    return nanoseconds
+
+
+def _nanoseconds(stamp: bytes, power: int) -> int:
+    """A stamp times 10 to ``power``, rounded; −1 where it is no time since 1970 (up to 2255), or
+    cut short, or, of nanoseconds, not whole."""
+    try:
+        exact = decimal.Decimal(stamp.decode("ascii")).scaleb(power)
+        if exact.adjusted() > 18:
+            return -1
+        whole = int(exact.to_integral_value(decimal.ROUND_HALF_EVEN))
+    except (ArithmeticError, ValueError):
+        return -1
+    fits = 0 <= whole < 9 * 10**18 and len(stamp) < _STAMP and (power > 0 or whole == exact)
+    return whole if fits else -1
 
 
 def _lines(path: Path, form: FileFormat) -> Iterator[tuple[int, list[str]]]:
     """Line number and fields of every data row, the slow way."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with _text(path) as file:
         if form.header:
             reader = csv.reader(file)
-            next(reader)
+            next(reader, None)
             yield from ((reader.line_num, fields) for fields in reader if fields)
         else:
             for number, line in enumerate(file, 1):
@@ -287,7 +255,7 @@ def _explain(path: Path, form: FileFormat, error: ValueError) -> NoReturn:
             if len(fields) != len(names):
                 raise DataError(f"{where}: {len(fields)} columns, not {len(names)}") from None
             for name, field in zip(names, fields, strict=True):
-                empty = not field and name in form.optional
+                empty = not field.strip() and name in form.optional
                 if name in form.columns and not empty and not _is_number(field):
                     raise DataError(f"{where}: {name} is {field[:40]!r}, not a number") from None
     raise DataError(f"{path}: cannot be parsed: {' '.join(str(error).split())}") from None
@@ -301,10 +269,15 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _cache_folder() -> Path:
-    if folder := os.environ.get("COLOC_CACHE"):
-        return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "coloc"
+def _cache_folder() -> Path | None:
+    """None where no home is known."""
+    chosen = os.environ.get("COLOC_CACHE")
+    base = chosen or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    try:
+        folder = Path(base).expanduser()
+    except RuntimeError:
+        return None
+    return folder if chosen else folder / "coloc"
 
 
 def _digest(text: str) -> str:

@@ -2,7 +2,8 @@
 
 Step k is at ``start + k dt``. Nothing measured is interpolated or invented: a step delivers what
 arrived in (t_{k−1}, t_k]; what drives a motion model (IMU, odometry) is integrated over that
-interval exactly, each sample held until the next.
+interval exactly, each sample held until the next. An IMU's sample is held for 0.1 s at most: beyond
+that its mean stands for it, and how wrong that may be is given with it.
 """
 
 from dataclasses import dataclass
@@ -10,10 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_env.datasets.files import DataError
-from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.recording import DataError, Flags, Floats, Recording, Stamps, Table, Track
 
-_TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this close to it
+_TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this close to it,
+_TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
+_TRUTH_BESIDE = 10_000_000  # ns: this close
+_LEAST_DT = 0.001  # s
+_HELD = 100_000_000  # ns, for which a sample of an IMU stands
+_LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
 @dataclass(frozen=True)
@@ -38,9 +43,12 @@ def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Gr
     """Steps over the longest span in which all robots have truth and every driving stream."""
     spans = [(t.time[0], t.time[-1]) for t in recording.truth]
     for name in drivers:
-        if name not in recording.streams:
+        tables = recording.streams.get(name, ())
+        if not tables or not all(len(table.time) for table in tables):
             raise DataError(f"{recording.name} has no {name} stream, which this scenario needs")
-        spans += [(t.time[0], t.time[-1]) for t in recording.streams[name]]
+        spans += [(table.time[0], table.time[-1]) for table in tables]
+    if not _LEAST_DT <= dt < np.inf:
+        raise ValueError(f"dt={dt} is not allowed: a time in s from {_LEAST_DT}")
     start, end = max(s for s, _ in spans), min(e for _, e in spans)
     count = int((end - start) // round(dt * 1e9)) + 1
     if count < 2:
@@ -49,7 +57,8 @@ def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Gr
 
 
 def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
-    """Position, velocity, attitude [T, …] at the steps, and where truth was close enough."""
+    """Position, velocity, attitude [T, …] at the steps, and where truth was close enough: within
+    50 ms, or 10 ms at the ends of a hole of more than 1 s."""
     times = grid.times
     position = _interpolate(times, track.time, track.position)
     attitude = _interpolate(times, track.time, track.attitude)
@@ -65,13 +74,15 @@ def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
             _interpolate(times + by, track.time, track.position) for by in (half, -half)
         )
         velocity = (ahead - behind) / grid.dt
-    after = np.searchsorted(track.time, times).clip(1, len(track.time) - 1)
-    gap = np.minimum(abs(track.time[after] - times), abs(times - track.time[after - 1]))
-    return position, velocity, attitude, gap <= _TRUTH_WITHIN
+    after = np.searchsorted(track.time, times).clip(0, len(track.time) - 1)
+    later, earlier = track.time[after], track.time[(after - 1).clip(0)]
+    apart = np.minimum(abs(later - times), abs(times - earlier))
+    near = np.where(later - earlier > _TRUTH_HOLE, _TRUTH_BESIDE, _TRUTH_WITHIN)
+    return position, velocity, attitude, apart <= near
 
 
 def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
-    """What a stream says over each step: samples [T, S, F] and for how long each holds [T, S] (s).
+    """A stream over each step: samples [T, S, F] and for how long each holds [T, S] (s).
 
     Sample i holds from its time to the next one's; step k covers (t_{k−1}, t_k], step 0 nothing.
     """
@@ -86,6 +97,31 @@ def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
     durations = np.zeros(samples.shape[:2])
     samples[step, slot], durations[step, slot] = table.values[source], length
     return samples, durations
+
+
+def bridged(table: Table) -> tuple[Table, Table, Floats]:
+    """An IMU's samples, and their mean from 0.1 s after the last sample before a hole on; 1 where
+    the mean stands and 0 elsewhere, in the same form; and the deviation of samples from the mean,
+    root mean square an axis: gyro (rad/s), accelerometer (m/s²)."""
+    mean = table.values.mean(0)
+    spread = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))
+    ends = np.flatnonzero(np.diff(table.time) > _HELD)
+    time = np.insert(table.time, ends + 1, table.time[ends] + _HELD)
+    values = np.insert(table.values, ends + 1, mean, 0)
+    missing = np.insert(np.zeros((len(table.time), 1)), ends + 1, 1.0, 0)
+    return Table(time, values, table.columns), Table(time, missing, ("missing",)), spread
+
+
+def unknown_on(grid: Grid, missing: Table, spread: Floats) -> Floats:
+    """``imu_unknown`` leaf [T, 2]: standard deviations an axis of what the ``imu`` leaf is off for
+    want of samples: accelerometer (m/s²), gyro (rad/s).
+
+    What was not measured is taken to be off by ``spread`` (gyro, accelerometer) for about a second
+    at a time: white noise that adds up to the same over a hole is √(2 · 1 s / dt) times that.
+    """
+    samples, durations = held_intervals(grid, missing)
+    share = (samples[..., 0] * durations).sum(1) / grid.dt
+    return share[:, None] * spread[::-1] * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
 
 
 def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:

@@ -5,8 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from coloc_env.datasets.files import DataError, FileFormat, distinct, fail, read
-from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.files import FileFormat, distinct, fail, read
+from coloc_env.datasets.folders import entries
+from coloc_env.datasets.recording import (
+    DataError,
+    Floats,
+    Recording,
+    Stamps,
+    Table,
+    Track,
+    plausible,
+)
 
 SOURCE = (
     "Comprehensive outdoor UWB dataset (Hanyang University); doi 10.5281/zenodo.15226105; "
@@ -19,19 +28,22 @@ _RANGES = FileFormat(
     header=True,
     whole=("field.id",),
     stamp_column="field.stamp",
+    optional=("field.distanceFromTag",),
 )
 _TRUTH = FileFormat(("x", "y", "heading_degrees"), "nanoseconds", ",", header=True)
 _TAG_HEIGHT = 1.1  # m above the ground
+_REACH = 300.0  # m, of ultra-wideband ranging
 
 
 def load_hanyang(folder: str | os.PathLike[str]) -> Recording:
     """Load one case: ``trajectory.csv`` and a file ``A<number>.csv`` for each anchor.
 
     The recording is in the plane. The tag moves on flat ground (by the truth it leaves its height
-    by less than 0.5 m), and anchors that are 0.5 to 2 m high and within 5 m of each other tell a
+    by less than 0.5 m), and anchors that are 0.5 to 2 m high and within 5 m of each other show a
     tag 10 to 50 m away nothing of its height. So each range r is made horizontal, sqrt(r^2 - h^2)
     with h the height between anchor and tag; the few ranges shorter than h (3 of 9447 in
-    NLOS/Trajectory_A) are dropped. The tag's height is not recorded: 1.1 m (fitted: 1.07 to
+    NLOS/Trajectory_A) are dropped, and those that are no range (not finite, not positive, beyond
+    300 m). The tag's height is not recorded: 1.1 m (fitted: 1.07 to
     1.13 m in the four cases).
 
     Time zero is the first truth, and stamps are as recorded. Anchors are in the order of their
@@ -59,13 +71,14 @@ def load_hanyang(folder: str | os.PathLike[str]) -> Recording:
     """
     folder = Path(folder)
     truth = distinct(read(folder / "trajectory.csv", _TRUTH))
-    numbers = sorted(_anchors_in(folder))
-    if not numbers:
+    files = _anchors_in(folder)
+    if not files:
         raise DataError(f"{folder}: no A<number>.csv")
-    anchors, times, rows = [], [], []
-    for index, number in enumerate(numbers):
-        place, time, distance = _anchor(folder / f"A{number}.csv", number)
+    anchors, times, rows, dropped = [], [], [], 0
+    for index, (number, path) in enumerate(sorted(files.items())):
+        place, time, distance, without = _anchor(path, number)
         anchors.append(place)
+        dropped += without
         times.append(time - truth.time[0])
         rows.append(np.column_stack((np.zeros(len(time)), np.full(len(time), index), distance)))
     time = np.concatenate(times)
@@ -82,28 +95,38 @@ def load_hanyang(folder: str | os.PathLike[str]) -> Recording:
         anchors=np.stack(anchors),
         tags=np.zeros((1, 1, 2)),
         source=SOURCE,
+        dropped={"anchor_ranges": dropped},
     )
 
 
 def sequences_in(folder: Path) -> dict[str, int]:
     """The cases, such as ``LOS/Trajectory_A/Case_1``, and their one tag."""
-    cases = sorted(path.parent for path in folder.glob("*/*/*/trajectory.csv"))
+    cases = [path.parent for path in entries(folder, "*/*/*/trajectory.csv")]
     return {case.relative_to(folder).as_posix(): 1 for case in cases}
 
 
-def _anchors_in(folder: Path) -> list[int]:
-    names = [path.stem.removeprefix("A") for path in folder.glob("A*.csv")]
-    return [int(name) for name in names if name.isdigit()]
+def _anchors_in(folder: Path) -> dict[int, Path]:
+    """The anchors' files by their numbers."""
+    files: dict[int, Path] = {}
+    for path in entries(folder, "A*.csv"):
+        number = path.stem.removeprefix("A")
+        if number.isdecimal():
+            other = files.setdefault(int(number), path)
+            if other != path:
+                raise DataError(f"{path}: the anchor of {other.name} again")
+    return files
 
 
-def _anchor(path: Path, number: int) -> tuple[Floats, Stamps, Floats]:
-    """Its place [2], and time [T] and horizontal distance [T] of its ranges."""
+def _anchor(path: Path, number: int) -> tuple[Floats, Stamps, Floats, int]:
+    """Its place [2], time [T] and horizontal distance [T] of its ranges, and how many were left
+    out."""
     time, values = read(path, _RANGES)
     if (strange := values[:, 0] != number).any():
         fail(path, _RANGES, strange, f"field.id is {values[strange][0, 0]:g}, not {number}")
     place, distance = values[0, 1:4], values[:, 4]
     if (moved := (values[:, 1:4] != place).any(axis=1)).any():
         fail(path, _RANGES, moved, "the anchor is in another place than before")
+    good = plausible(distance, _REACH)
     squared = distance**2 - (place[2] - _TAG_HEIGHT) ** 2
-    there = (squared >= 0) & (distance >= 0)
-    return place[:2], time[there], np.sqrt(squared[there])
+    there = good & (squared >= 0)
+    return place[:2], time[there], np.sqrt(squared[there]), int((~good).sum())

@@ -10,16 +10,20 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
+from coloc_env.datasets.files import FileFormat, Rows, distinct, fail, read
+from coloc_env.datasets.folders import entries
 from coloc_env.datasets.recording import (
     IMU_COLUMNS,
+    DataError,
     Flags,
     Floats,
     Recording,
     Stamps,
     Table,
     Track,
+    check_places,
     one_hemisphere,
+    plausible,
 )
 
 SOURCE = (
@@ -29,8 +33,8 @@ SOURCE = (
 _XYZ = ("x", "y", "z")
 
 
-def _csv(*columns: str, whole: tuple[str, ...] = ()) -> FileFormat:
-    return FileFormat(columns, "relative seconds", ",", header=True, whole=whole)
+def _csv(*columns: str, whole: tuple[str, ...] = (), optional: tuple[str, ...] = ()) -> FileFormat:
+    return FileFormat(columns, "relative seconds", ",", header=True, whole=whole, optional=optional)
 
 
 _TRUTH = _csv(
@@ -39,12 +43,15 @@ _TRUTH = _csv(
 _IMU = _csv(
     *(f"{what}.{axis}" for what in ("angular_velocity", "linear_acceleration") for axis in _XYZ)
 )
-_HEIGHT = _csv("range")
+_HEIGHT = _csv("range", optional=("range",))
 _MAGNETOMETER = _csv(*(f"magnetic_field.{axis}" for axis in _XYZ))
 _RANGES = {
-    "calibrated": _csv("from_id", "to_id", "range", whole=("from_id", "to_id")),
-    "raw": _csv("from_id", "to_id", "range_raw", whole=("from_id", "to_id")),
+    name: _csv("from_id", "to_id", column, whole=("from_id", "to_id"), optional=(column,))
+    for name, column in (("calibrated", "range"), ("raw", "range_raw"))
 }
+_FILES = ("mocap.csv", "uwb_range.csv", "imu_px4.csv", "imu_cam.csv", "height.csv")  # of a robot
+_REACH = 300.0  # m, of ultra-wideband ranging
+_LASER_REACH = 100.0  # m
 _JUMP = np.deg2rad(30)
 _LASTING = 1_000_000_000  # ns
 
@@ -70,9 +77,9 @@ def load_miluv(
     - calibrated ranges: to anchors +0.02 m, robust deviation 0.09 m, 8 % beyond 0.5 m, all too
       long; between robots -0.02 m, 0.10 m, 4 %; raw ranges are about 0.1 m longer
     - height: robust deviation 0.03 to 0.10 m, as an offset that changes with the place (up to
-      0.2 m for ifo002); on the ground the laser says 0.29 m, its minimum, 0.19 to 0.27 too high
+      0.2 m for ifo002); on the ground the laser reads 0.29 m, its minimum, 0.19 to 0.27 too high
     - IMU: px4's frame is turned against Vicon's body by about 3 degrees (rotation vectors, px4 to
-      Vicon: -1.6, 2.5, 0.8; 1.1, 0.6, 3.1; 1.0, -2.3, -2.2), so that gravity looks like an
+      Vicon: -1.6, 2.5, 0.8; 1.1, 0.6, 3.1; 1.0, -2.3, -2.2), so that gravity appears as an
       accelerometer bias of up to 0.5 m/s^2. Over 1 s its gyro and Vicon differ by 0.011 to
       0.017 rad even when aligned, which is Vicon's error: the gyros of px4 and camera agree to
       0.004, and px4's drifts by no more than 0.1 rad in 60 s
@@ -99,18 +106,20 @@ def load_miluv(
     if not robots:
         raise DataError(f"{folder}: no robot's folder with mocap.csv")
     homes = [folder / robot for robot in robots]
-    anchors = _anchors(settings, folder.name)
+    anchors = _anchors(settings, folder.name, robots)
     tags = _tags(settings, robots)
 
-    streams = _exchanges(homes, anchors, tags, _RANGES[ranges])
+    streams, dropped = _exchanges(homes, anchors, tags, _RANGES[ranges])
     if rows := _of_all(homes, "imu_cam.csv" if imu == "camera" else "imu_px4.csv", _IMU):
         turns = [_camera_to_px4(settings, robot) if imu == "camera" else None for robot in robots]
         streams["imu"] = tuple(map(_imu, rows, turns))
     if rows := _of_all(homes, "height.csv", _HEIGHT):
         biases = _height_biases(settings, robots)
+        there = [plausible(values[:, 0], _LASER_REACH) for _, values in rows]
+        dropped["height"] = sum(int((~good).sum()) for good in there)
         streams["height"] = tuple(
-            Table(time, values - bias, ("height",))
-            for (time, values), bias in zip(rows, biases, strict=True)
+            Table(time[good], values[good] - bias, ("height",))
+            for (time, values), good, bias in zip(rows, there, biases, strict=True)
         )
     if rows := _of_all(homes, "mag.csv", _MAGNETOMETER):
         streams["magnetometer"] = tuple(Table(*each, _XYZ) for each in rows)
@@ -124,12 +133,14 @@ def load_miluv(
         anchors=anchors.positions,
         tags=_lever_arms(tags),
         source=SOURCE,
+        dropped=dropped,
     )
 
 
 def robots_in(folder: Path) -> tuple[str, ...]:
-    """The robots of an experiment, in the order of their names."""
-    return tuple(sorted(path.parent.name for path in folder.glob("*/mocap.csv")))
+    """The robots of an experiment, in the order of their names; their files may be incomplete."""
+    folders = [path for path in entries(folder) if path.is_dir()]
+    return tuple(path.name for path in folders if any((path / file).is_file() for file in _FILES))
 
 
 def _of_all(homes: Sequence[Path], file: str, form: FileFormat) -> list[Rows]:
@@ -178,8 +189,9 @@ class _Points:
 
 def _exchanges(
     homes: Sequence[Path], anchors: _Points, tags: Sequence[_Points], form: FileFormat
-) -> dict[str, tuple[Table, ...]]:
-    """The tables of ranges. An end is (robot, tag), an anchor's end is (-1, anchor), indices."""
+) -> tuple[dict[str, tuple[Table, ...]], dict[str, int]]:
+    """The tables of ranges, and how many of each were left out. An end is (robot, tag), an anchor's
+    end is (-1, anchor), indices."""
     starts = {
         number: (robot, index)
         for robot, points in enumerate(tags)
@@ -189,7 +201,7 @@ def _exchanges(
     logged, measured = [], []
     for home in homes:
         path = home / "uwb_range.csv"
-        time, values = read(path, form)
+        time, values = read(path, form, empty=True)
         for column, known in enumerate((starts, ends)):
             if (strange := ~np.isin(values[:, column], list(known))).any():
                 number = values[strange][0, column]
@@ -198,8 +210,14 @@ def _exchanges(
         measured.append(values[:, 2])
     exchanges, first = np.unique(np.concatenate(logged), axis=0, return_index=True)
     time, distance = exchanges[:, 0], np.concatenate(measured)[first]
-    start = np.array([starts[number] for number in exchanges[:, 1]])
-    end = np.array([ends[number] for number in exchanges[:, 2]])
+    start = np.array([starts[number] for number in exchanges[:, 1]], int).reshape(-1, 2)
+    end = np.array([ends[number] for number in exchanges[:, 2]], int).reshape(-1, 2)
+    good = plausible(distance, _REACH)
+    dropped = {
+        "uav_ranges": int((~good & (end[:, 0] >= 0)).sum()),
+        "anchor_ranges": int((~good & (end[:, 0] < 0)).sum()),
+    }
+    time, distance, start, end = time[good], distance[good], start[good], end[good]
 
     to_anchor, to_uav = [], []
     for robot in range(len(homes)):
@@ -213,19 +231,27 @@ def _exchanges(
         values = np.column_stack((own[:, 1], other, distance))
         to_uav.append(Table(time[mine], values[mine], ("own_tag", "robot", "tag", "range")))
     tables = {"uav_ranges": tuple(to_uav), "anchor_ranges": tuple(to_anchor)}
-    return {name: team for name, team in tables.items() if any(len(each.time) for each in team)}
+    streams = {name: team for name, team in tables.items() if any(len(each.time) for each in team)}
+    return streams, dropped
 
 
-def _anchors(settings: Path, experiment: str) -> _Points:
+def _anchors(settings: Path, experiment: str, robots: Sequence[str]) -> _Points:
+    """The anchors of an experiment, which must have so many robots."""
     path = settings / "experiments.csv"
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            table = {row["experiment"]: row["anchor_constellation"] for row in csv.DictReader(file)}
+        with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+            table = {row["experiment"]: row for row in csv.DictReader(file)}
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise _config_error(path, error) from None
     if experiment not in table:
         raise DataError(f"{path}: no line for the experiment {experiment!r}")
-    return _points(settings / "uwb" / "anchors.yaml", table[experiment])
+    row = table[experiment]
+    if row.get("num_robots") not in (None, str(len(robots))):
+        found = ", ".join(robots)
+        raise DataError(f"{path}: {experiment} has {row['num_robots']} robots, found are {found}")
+    if row.get("anchor_constellation") is None:
+        raise _config_error(path, KeyError("anchor_constellation"))
+    return _points(settings / "uwb" / "anchors.yaml", row["anchor_constellation"])
 
 
 def _tags(settings: Path, robots: Sequence[str]) -> list[_Points]:
@@ -246,20 +272,23 @@ def _points(path: Path, key: str) -> _Points:
     try:
         points = sorted((int(number), yaml.safe_load(text)) for number, text in entries.items())
         positions = np.array([position for _, position in points], float)
-    except (AttributeError, TypeError, ValueError, yaml.YAMLError) as error:
+    except (AttributeError, TypeError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise _config_error(path, error) from None
-    if positions.shape != (len(points), 3) or not np.isfinite(positions).all():
+    if positions.shape != (len(points), 3):
         raise DataError(f"{path}: {key!r} does not hold vectors of three numbers")
+    check_places(f"{path}: {key}", positions)
     return _Points(tuple(number for number, _ in points), positions)
 
 
 def _height_biases(settings: Path, robots: Sequence[str]) -> list[float]:
     path = settings / "height" / "bias.yaml"
-    entries = [_entry(path, robot) for robot in robots]
     try:
-        return [float(entry) for entry in entries]
+        biases = [float(_entry(path, robot)) for robot in robots]
     except (TypeError, ValueError) as error:
         raise _config_error(path, error) from None
+    if not all(abs(bias) < _LASER_REACH for bias in biases):
+        raise DataError(f"{path}: a bias is none of a laser")
+    return biases
 
 
 def _camera_to_px4(settings: Path, robot: str) -> Floats:
@@ -283,8 +312,9 @@ def _rotation(path: Path) -> Floats:
 
 def _entry(path: Path, key: str) -> Any:
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))[key]
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            return yaml.safe_load(file)[key]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise _config_error(path, error) from None
 
 

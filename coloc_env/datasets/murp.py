@@ -7,8 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from coloc_env.datasets.files import DataError, FileFormat, Rows, distinct, fail, read
-from coloc_env.datasets.recording import Flags, Floats, Recording, Table, Track, one_hemisphere
+from coloc_env.datasets.files import FileFormat, Rows, distinct, fail, read
+from coloc_env.datasets.folders import entries
+from coloc_env.datasets.recording import (
+    DataError,
+    Flags,
+    Floats,
+    Recording,
+    Table,
+    Track,
+    one_hemisphere,
+    plausible,
+)
 
 SOURCE = (
     "MURP, MIT ACL; Fishberg, Quiter, How, RA-L 2024 (arXiv 2312.17731); "
@@ -27,6 +37,7 @@ _FORMAT = FileFormat(
     optional=_RANGES,
 )
 _NAME = re.compile(r"(.+)_base-(\d+)_targ-(\d+)_win-1_step-1\.csv")
+_REACH = 300.0  # m, of ultra-wideband ranging
 _RADIUS = 0.32  # m, of the circle that the antennas are on
 
 
@@ -39,8 +50,9 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
     files: those of NOTES.md, fitted to the true distances of its ranges, hold for all agents
     (antenna i at 0.32 m and 30 + 60 (i − 1) degrees in the body's xy plane). Stream: uav_ranges;
     the table of an agent holds what it measured as base, since A → B and B → A are two
-    measurements. A field without a number (one in trial 16) is a range that was not measured; a
-    range of 0 (5 in trial 14, where the antennas were within 0.22 m) stands as it is.
+    measurements. A field without a number (one in trial 16) is a range that was not measured. What
+    is no range (not finite, not positive, beyond 300 m) is left out, such as the 5 zeros in trial
+    14, where the antennas were within 0.22 m.
 
     Measured on trials 09, 14 and 16, range minus truth: agents 2 and 3 are -0.11 to -0.14 m off
     (median; robust deviation 0.07 m), agent 1 and either +0.03 to +0.12 m (0.09 to 0.14 m, at most
@@ -49,8 +61,8 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
     files are not (they differ by up to 0.5 m and 1 degree), and are not used.
 
     Raises:
-        DataError: a file is missing or damaged, files differ in their stamps, or in an agent's
-            pose, or a range is negative.
+        DataError: a file is missing or damaged, or files differ in their stamps or in an agent's
+            pose.
     """
     folder = Path(folder)
     agents = agents_in(folder)
@@ -69,10 +81,12 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
             moved: Flags = np.logical_or.reduce(apart, axis=1)
             if moved.any():
                 fail(path, _FORMAT, moved, f"agent {agent} is elsewhere than in another file")
-        bad: Flags = np.logical_or.reduce(each.values[:, 12:] < 0, axis=1)
-        if bad.any():
-            fail(path, _FORMAT, bad, "a range is negative")
     time = rows[first].time
+    known = sum(int((~np.isnan(each.values[:, 12:])).sum()) for each in rows.values())
+    tables = tuple(
+        _ranges([(i, rows[base, other]) for i, other in enumerate(agents) if other != base])
+        for base in agents
+    )
     angle = np.deg2rad(30 + 60 * np.arange(ANTENNAS))
     arms = _RADIUS * np.stack((np.cos(angle), np.sin(angle), np.zeros(ANTENNAS)), -1)
     return Recording(
@@ -82,22 +96,18 @@ def load_murp(folder: str | os.PathLike[str]) -> Recording:
         truth=tuple(
             Track(time, poses[agent][:, :3], _quaternions(poses[agent][:, 3:])) for agent in agents
         ),
-        streams={
-            "uav_ranges": tuple(
-                _ranges([(i, rows[base, other]) for i, other in enumerate(agents) if other != base])
-                for base in agents
-            )
-        },
+        streams={"uav_ranges": tables},
         landmarks=np.empty((0, 3)),
         anchors=np.empty((0, 3)),
         tags=np.tile(arms, (len(agents), 1, 1)),
         source=SOURCE,
+        dropped={"uav_ranges": known - sum(len(table.time) for table in tables)},
     )
 
 
 def agents_in(folder: Path) -> tuple[int, ...]:
     """The numbers of the agents that a trial's files are of."""
-    names = [_NAME.fullmatch(path.name) for path in folder.glob("*.csv")]
+    names = [_NAME.fullmatch(path.name) for path in entries(folder, "*.csv")]
     found = {int(number) for name in names if name for number in name.groups()[1:]}
     return tuple(sorted(found))
 
@@ -111,7 +121,7 @@ def _ranges(measured: list[tuple[int, Rows]]) -> Table:
     time, values = [], []
     for robot, rows in measured:
         ranges = rows.values[:, 12:]
-        step, pair = np.nonzero(np.isfinite(ranges))
+        step, pair = np.nonzero(plausible(ranges, _REACH))
         own, other = np.array(_PAIRS).T[:, pair]
         time.append(rows.time[step])
         who = np.full(len(step), robot)

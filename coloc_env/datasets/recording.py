@@ -1,7 +1,7 @@
 """What a loader returns: the ground truth and the sensor streams of one recorded experiment."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,12 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+FARTHEST = 1e7  # m from the origin: no position on Earth, in whatever map's metres, is beyond
 IMU_COLUMNS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+
+
+class DataError(ValueError):
+    """Recorded data that are missing or not what they should be; one line that says where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +35,8 @@ class Track:
         accel_bias: [T, 3] m/s^2 in the body frame, None where the recording has none.
 
     Raises:
-        ValueError: shapes that do not agree, or times that do not increase.
+        ValueError: shapes that do not agree, times that do not increase, or a position that is not
+            finite or farther than 10 000 km from the origin.
     """
 
     time: Stamps
@@ -53,6 +59,7 @@ class Track:
             if array is not None and array.shape != shape:
                 raise ValueError(f"Track.{name} has shape {array.shape}, not {shape}")
         _check_time(self.time, steps, strictly=True)
+        check_places("Track.position", self.position)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +112,13 @@ class Recording:
         tags: [N, K, d] lever arms of the ranging tags in the body frame, metres; K = 0 without
             tags, rows of NaN where a robot has fewer than K.
         source: citation and licence.
+        origin: [d] metres: where the origin of all that stands here is in the world frame that was
+            recorded.
+        dropped: stream name to how many of its measurements were left out, since the sensor cannot
+            have given them: not finite, not positive, or beyond its reach.
 
     Raises:
-        ValueError: shapes or numbers of robots that do not agree.
+        ValueError: shapes or numbers of robots that do not agree, or a place that is not finite.
     """
 
     name: str
@@ -119,6 +130,8 @@ class Recording:
     anchors: Floats
     tags: Floats
     source: str
+    origin: tuple[float, ...] = ()
+    dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         robots = len(self.robots)
@@ -130,8 +143,45 @@ class Recording:
         for what, array in {"landmarks": self.landmarks, "anchors": self.anchors}.items():
             if array.ndim != 2 or array.shape[1] != self.dim:
                 raise ValueError(f"Recording.{what} has shape {array.shape}, not [n, {self.dim}]")
+            check_places(f"Recording.{what}", array)
         if self.tags.ndim != 3 or self.tags.shape[::2] != (robots, self.dim):
             raise ValueError(f"Recording.tags has shape {self.tags.shape}, not [{robots}, K, d]")
+
+
+def plausible(distance: Floats, most: float) -> Flags:
+    """Which distances a sensor that reaches ``most`` m can have measured."""
+    return np.isfinite(distance) & (distance > 0) & (distance <= most)
+
+
+def near_origin(recording: Recording) -> Recording:
+    """The recording about an origin of its own, the middle of its truth to the kilometre, so that
+    float32 has digits enough; unchanged where that is within half a kilometre of the origin."""
+    places = np.concatenate([track.position for track in recording.truth])
+    middle = 0.5 * (places.min(0) + places.max(0))
+    origin = 1000.0 * np.round(middle / 1000.0)
+    if not origin.any():
+        return recording
+    streams = dict(recording.streams)
+    if recording.dim == 3 and "height" in streams:
+        streams["height"] = tuple(
+            replace(table, values=table.values - origin[2]) for table in streams["height"]
+        )
+    return replace(
+        recording,
+        truth=tuple(replace(track, position=track.position - origin) for track in recording.truth),
+        streams=streams,
+        landmarks=recording.landmarks - origin,
+        anchors=recording.anchors - origin,
+        origin=tuple(origin.tolist()),
+    )
+
+
+def check_places(what: str, places: Floats) -> None:
+    """Raise ValueError for a place that is not finite, or not on Earth."""
+    bad = ~(np.abs(places) <= FARTHEST).all(axis=-1)
+    if bad.any():
+        shown = ", ".join(f"{value:g}" for value in places[bad][0])
+        raise DataError(f"{what}: ({shown}) is no place within {FARTHEST:g} m of the origin")
 
 
 def one_hemisphere(quaternions: Floats) -> Floats:

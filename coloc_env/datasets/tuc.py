@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from coloc_env.datasets.files import FileFormat, Rows, distinct, fail, read
-from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.folders import entries
+from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track, plausible
 
 SOURCE = "The Labyrinth Dataset; Pfeifer (TU Chemnitz), in libRSF, 2017-2023; CC BY-SA 4.0"
 _RANGES = FileFormat(
@@ -14,6 +15,7 @@ _RANGES = FileFormat(
     "relative seconds",
     whole=("anchor",),
     words=("range2", "odom2diff"),
+    optional=("range",),
 )
 _ODOMETRY = FileFormat(
     ("wheel_1", "wheel_2", "sideways", "base", "variance_1", "variance_2", "variance_sideways"),
@@ -21,6 +23,7 @@ _ODOMETRY = FileFormat(
     words=("odom2diff", "range2"),
 )
 _TRUTH = FileFormat(("x", "y", "xx", "xy", "yx", "yy"), "relative seconds", words=("point2",))
+_REACH = 300.0  # m, of ultra-wideband ranging
 _MOVING = 0.1  # m/s: the truth is given to 4 mm, each 0.13 s
 
 
@@ -33,7 +36,7 @@ def load_tuc(stem: str | os.PathLike[str]) -> Recording:
     (so turns on the spot and backward travel are not in it). Streams: anchor_ranges, odometry.
 
     Wheel speeds become v, their mean, and omega, the second less the first over twice ``base``:
-    other than the readme says, the first column is the left wheel's and ``base`` half the distance
+    unlike in the readme, the first column is the left wheel's and ``base`` half the distance
     between the wheels; so the odometry alone follows the truth's 9.2 m within 0.04 m RMS (start
     fitted, and speed and turn scaled by 0.99 and 1.015).
 
@@ -42,6 +45,8 @@ def load_tuc(stem: str | os.PathLike[str]) -> Recording:
     more than 0.3 m, all too long, over half of those to anchor 107. Ranges and truth are in time
     (best lag 0.03 s), odometry and truth too (-0.03 s). Stamps are 0.128 s apart, with gaps of
     0.047 s more at 23 s and 0.032 s more at 25 s.
+
+    Ranges that are none (not finite, not positive, beyond 300 m) are left out.
 
     Raises:
         DataError: a file is missing or damaged, or an anchor has two places.
@@ -56,25 +61,29 @@ def load_tuc(stem: str | os.PathLike[str]) -> Recording:
     if (bad := wheels.values[:, 3] <= 0).any():
         fail(source, _ODOMETRY, bad, "the distance between the wheels is not positive")
     heard = np.column_stack((np.zeros(len(index)), index.astype(np.float64), ranges.values[:, 0]))
+    there = plausible(heard[:, 2], _REACH)
     return Recording(
         name=f"tuc/{stem.name}",
         dim=2,
         robots=("robot",),
         truth=(_track(read(stem.with_name(f"{stem.name}_GT.txt"), _TRUTH)),),
         streams={
-            "anchor_ranges": (Table(ranges.time, heard, ("own_tag", "anchor", "range")),),
+            "anchor_ranges": (
+                Table(ranges.time[there], heard[there], ("own_tag", "anchor", "range")),
+            ),
             "odometry": (_odometry(wheels),),
         },
         landmarks=np.empty((0, 2)),
         anchors=anchors,
         tags=np.zeros((1, 1, 2)),
         source=SOURCE,
+        dropped={"anchor_ranges": int((~there).sum())},
     )
 
 
 def sequences_in(folder: Path) -> dict[str, int]:
     """What the names of a sequence's two files have in common, and its one robot."""
-    truths = sorted(path.name.removesuffix("_GT.txt") for path in folder.glob("*_GT.txt"))
+    truths = [path.name.removesuffix("_GT.txt") for path in entries(folder, "*_GT.txt")]
     return {name: 1 for name in truths if (folder / f"{name}_Input.txt").is_file()}
 
 

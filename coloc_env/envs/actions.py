@@ -1,14 +1,15 @@
-"""Action modes: what an action means, what an agent sees for it, and the error for a wrong one.
+"""Action modes: what an action means, what an agent observes for it, and the error for a wrong one.
 
-The world scores estimates, whatever the mode: a mode turns actions into them. Filters act in
+The world scores estimates, whatever the mode: a mode turns actions into them. Localizers act in
 ``estimate``; learners in ``displacement`` (``coloc_env.envs.displacement``) or with corrections
-on a localizer (``agents.with_base``).
+on a localizer's estimates (``agents.wrappers.correction.with_base``).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
@@ -19,7 +20,7 @@ from coloc_env.sensors.base import Leaf
 from coloc_env.world import World
 
 Leaves = dict[str, Float32[Tensor, "B N F"]]
-FARTHEST = 100.0  # m: errors beyond are cut in the privileged state, whose bounds are finite
+MAX_STATE_ERROR = 100.0  # m: larger errors are cut in the privileged state, whose bounds are finite
 
 
 class ActionMode(ABC):
@@ -45,6 +46,11 @@ class ActionMode(ABC):
         return [-1.0] * self.dim, [1.0] * self.dim
 
     @property
+    def width(self) -> int:
+        """How many numbers one UAV's action has."""
+        return len(self.bounds[0])
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What describes it, beside the beliefs."""
         return {"name": self.name}
@@ -66,8 +72,8 @@ class ActionMode(ABC):
     def estimate(
         self, memory: Any, action: Float32[Tensor, "B N a"]
     ) -> tuple[Any, Float32[Tensor, "B N A"]]:
-        """The memory after an action, and the estimate ``[position (m), velocity (m/s), log-std]``
-        that it stands for."""
+        """The memory after an action, and the estimate that it stands for: position (m), velocity
+        (m/s) and log standard deviation of the position (m), each per axis of the world frame."""
 
     def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
         """The position (m) that actions are relative to; None where they are not."""
@@ -90,40 +96,46 @@ class Estimates(ActionMode):
         return None, action
 
 
-class Pilot:
-    """An action mode at work in the worlds of one environment: it keeps their memory."""
+class ModeRunner:
+    """An action mode at work in the worlds of one environment: it keeps their memory.
+
+    The leaves that it gives are copies, which agents may edit.
+    """
 
     def __init__(self, mode: ActionMode, world: World) -> None:
         self.mode, self.world = mode, world
-        self.width = len(mode.bounds[0])
-        self._silent = not mode.leaves and type(mode).reset is ActionMode.reset
-        self._begun = False
+        self.width = mode.width
+        self._adds_nothing = not mode.leaves and type(mode).reset is ActionMode.reset
+        self._started = False
         self._memory: Any = None
         self._leaves: Leaves = {}
 
     def reset(self, rows: Bool[Tensor, "B"] | None = None) -> Leaves:
-        """Start the rows that have been reset anew (None: all) and return every row's leaves at
-        the current step."""
-        if self._silent:
+        """Restart the rows that have been reset (None: all) and return every row's leaves at the
+        current step."""
+        if self._adds_nothing:
             return {}
         observation = self.world.observation()
         fresh, leaves = self.mode.observe(self.mode.reset(observation), observation)
-        if rows is not None and self._begun and not bool(rows.all()):
+        if rows is not None and self._started and not bool(rows.all()):
             chosen = rows[:, None].expand(observation.batch_size)
             fresh = None if fresh is None else fresh.where(chosen, self._memory)
             leaves = {
                 name: torch.where(chosen.unsqueeze(-1), leaf, self._leaves[name])
                 for name, leaf in leaves.items()
             }
-        self._memory, self._leaves, self._begun = fresh, leaves, True
-        return leaves
+        self._memory, self._leaves, self._started = fresh, leaves, True
+        return self._copies()
 
     def observe(self) -> Leaves:
         """The leaves at the step that the worlds have moved to."""
-        if not self._silent:
-            observation = self.world.observation()
-            self._memory, self._leaves = self.mode.observe(self._memory, observation)
-        return self._leaves
+        if self._adds_nothing:
+            return {}
+        self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
+        return self._copies()
+
+    def _copies(self) -> Leaves:
+        return {name: leaf.clone() for name, leaf in self._leaves.items()}
 
     def estimate(self, action: Float32[Tensor, "B N a"]) -> Float32[Tensor, "B N A"]:
         """The estimates that actions stand for."""
@@ -136,7 +148,7 @@ class Pilot:
         truth, reference = self.world.state(), self.mode.reference(self._memory)
         if reference is None:
             return truth
-        error = (reference - self.world.now.target).clamp(-FARTHEST, FARTHEST)
+        error = (reference - self.world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
         return torch.cat((truth, error.flatten(-2)), -1)
 
 
@@ -151,7 +163,7 @@ def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
         return Estimates(scenario.believed)
     if action == "displacement":
         from coloc_env.envs.displacement import (
-            Displacement,  # takes a second that filters need not wait
+            Displacement,  # tensordict takes a second that localizers need not wait
         )
 
         return Displacement(scenario.believed)
@@ -184,22 +196,73 @@ def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float]
     low, high = state_bounds(scenario)
     if type(mode).reference is not ActionMode.reference:
         more = scenario.arena.n_uavs * mode.dim
-        low, high = low + [-FARTHEST] * more, high + [FARTHEST] * more
+        low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
     return low, high
 
 
-def check(scenario: Scenario, mode: ActionMode, actions: Tensor, worlds: int) -> None:
-    """Raise a ValueError for actions of a wrong shape or with values that are not finite."""
-    shape = (worlds, scenario.arena.n_uavs, len(mode.bounds[0]))
+# ------------------------------------------------------------------ checks of actions
+
+
+def checked_tensor(
+    scenario: Scenario, mode: ActionMode, actions: Tensor, worlds: int
+) -> Float32[Tensor, "B N a"]:
+    """Actions of several worlds as float32. ValueError, in one line that names UAV, world and what
+    is needed, for another shape, complex numbers, and NaN or infinity."""
+    shape = (worlds, scenario.arena.n_uavs, mode.width)
     if tuple(actions.shape) != shape:
         raise ValueError(
             f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
             f"(worlds, UAVs, {mode.meaning}) is needed with action={mode.name}"
         )
+    if actions.is_complex():
+        raise ValueError(f"{scenario.name}: complex actions do not fit; {_needed(mode)}")
+    actions = actions.to(torch.float32)
     finite = actions.isfinite()
     if not bool(finite.all()):
         row, uav, _ = (~finite).nonzero()[0].tolist()
         raise ValueError(
-            f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; every "
-            "number must be finite"
+            f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; "
+            f"{_needed(mode)}"
         )
+    return actions
+
+
+def checked_arrays(
+    scenario: Scenario, mode: ActionMode, actions: Mapping[str, Any], agents: Sequence[str]
+) -> Float32[np.ndarray, "n a"]:
+    """The agents' actions, one a row. ValueError, in one line that names the agent and what is
+    needed, for one that is not numeric, complex, of another shape, or holds NaN or infinity."""
+    rows = _array([actions[agent] for agent in agents])
+    if rows is not None and rows.shape == (len(agents), mode.width):
+        values = rows.astype(np.float32)
+        if np.count_nonzero(np.isfinite(values)) == values.size:
+            return values
+    return np.stack([_checked_array(scenario, mode, actions[agent], agent) for agent in agents])
+
+
+def _checked_array(
+    scenario: Scenario, mode: ActionMode, action: Any, agent: str
+) -> Float32[np.ndarray, "a"]:
+    values = _array(action)
+    if values is None:
+        wrong = "is not made of real numbers"
+    elif values.shape != (mode.width,):
+        wrong = f"has shape {values.shape}"
+    elif not np.isfinite(values.astype(np.float32)).all():
+        wrong = "holds NaN or infinity"
+    else:
+        return values.astype(np.float32)
+    raise ValueError(f"{scenario.name}: the action of {agent} {wrong}; {_needed(mode)}")
+
+
+def _array(numbers: Any) -> np.ndarray | None:
+    """An array of real numbers; None for anything else."""
+    try:
+        array = np.asarray(numbers)
+    except (TypeError, ValueError, RuntimeError):
+        return None
+    return array if array.dtype.kind in "fiub" else None
+
+
+def _needed(mode: ActionMode) -> str:
+    return f"({mode.width},) finite numbers are needed with action={mode.name}: {mode.meaning}"

@@ -6,16 +6,16 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from coloc_env.envs.actions import ActionMode, Leaves
-from coloc_env.envs.fixes import fix_leaves, relative_fixes, turned
+from coloc_env.envs.fixes import fix_leaves, next_attitude, relative_fixes
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors.base import Leaf
 
-REACH = 1.0  # m: how far an action of 1 moves the estimate
-_LOG_STD = 0.0  # of a standard deviation of 1 m: what messages say of such estimates
+STEP = 1.0  # m: how far an action of 1 moves the estimate
+_LOG_STD = 0.0  # of the standard deviation of 1 m that such estimates are given
 
 
-class Reckoned(TensorClass):
+class DisplacementMemory(TensorClass):
     """The last estimate (m), the attitude by dead reckoning, the last action, and steps taken."""
 
     position: Float32[Tensor, "B N d"]
@@ -47,18 +47,20 @@ class Displacement(ActionMode):
         attitude = Leaf(4 if self.dim == 3 else 1)
         return {"attitude": attitude, **self._fixes, "last_action": Leaf(self.dim, -1.0, 1.0)}
 
-    def reset(self, observation: Observation) -> Reckoned:
+    def reset(self, observation: Observation) -> DisplacementMemory:
         prior, d = observation["prior"], self.dim
-        return Reckoned(
-            position=prior[..., :d],
-            attitude=prior[..., 2 * d : -2 - d],
+        return DisplacementMemory(
+            position=prior[..., :d].clone(),
+            attitude=prior[..., 2 * d : -2 - d].clone(),
             last_action=torch.zeros_like(prior[..., :d]),
             step=torch.zeros(prior.shape[:2], dtype=torch.int64, device=prior.device),
             batch_size=prior.shape[:2],
         )
 
-    def observe(self, memory: Reckoned, observation: Observation) -> tuple[Reckoned, Leaves]:
-        attitude = turned(self.believed, observation, memory.attitude)
+    def observe(
+        self, memory: DisplacementMemory, observation: Observation
+    ) -> tuple[DisplacementMemory, Leaves]:
+        attitude = next_attitude(self.believed, observation, memory.attitude)
         attitude = torch.where((memory.step > 0).unsqueeze(-1), attitude, memory.attitude)
         leaves: Leaves = {"attitude": attitude}
         if self._fixes:
@@ -68,13 +70,13 @@ class Displacement(ActionMode):
         return memory.replace(attitude=attitude), leaves
 
     def estimate(
-        self, memory: Reckoned, action: Float32[Tensor, "B N d"]
-    ) -> tuple[Reckoned, Float32[Tensor, "B N A"]]:
+        self, memory: DisplacementMemory, action: Float32[Tensor, "B N d"]
+    ) -> tuple[DisplacementMemory, Float32[Tensor, "B N A"]]:
         action = action.clamp(-1.0, 1.0)
-        position = memory.position + REACH * action
+        position = memory.position + STEP * action
         rest = torch.zeros_like(position)
         after = memory.replace(position=position, last_action=action, step=memory.step + 1)
         return after, torch.cat((position, rest, rest + _LOG_STD), -1)
 
-    def reference(self, memory: Reckoned) -> Float32[Tensor, "B N d"]:
+    def reference(self, memory: DisplacementMemory) -> Float32[Tensor, "B N d"]:
         return memory.position

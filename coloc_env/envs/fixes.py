@@ -1,4 +1,4 @@
-"""Fixes: where each measured landmark, with an attitude, puts a UAV; what learners see of them."""
+"""Position fixes: where each measured landmark, with an attitude, puts a UAV; leaves of them."""
 
 import torch
 from jaxtyping import Bool, Float32
@@ -45,7 +45,7 @@ def relative_fixes(
     """Leaves of the fixes relative to a position (0 where nothing was measured), and the fixes."""
     places, mask = fixes(believed, observation, attitude)
     apart = (places - position.unsqueeze(-2)) * mask.unsqueeze(-1)
-    count = mask.sum(-1, keepdim=True)
+    count = mask.sum(-1, keepdim=True, dtype=torch.float32)
     leaves = {
         "landmark_fixes": apart.flatten(-2),
         "landmark_fix_mask": mask.to(torch.float32),
@@ -55,10 +55,10 @@ def relative_fixes(
     return leaves, apart, mask
 
 
-def turned(
+def next_attitude(
     believed: Believed, observation: Observation, attitude: Float32[Tensor, "B N a"]
 ) -> Float32[Tensor, "B N a"]:
-    """An attitude one step on, as gyroscope or odometry say; the same where there is neither."""
+    """An attitude one step on, by gyroscope or odometry; the same where there is neither."""
     for sensor in believed.sensors:
         rate = sensor.turn_rate(observation.leaves)
         if rate is not None:

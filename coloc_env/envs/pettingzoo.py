@@ -8,12 +8,14 @@ import gymnasium as gym
 import numpy as np
 import torch
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils import parallel_to_aec
+from pettingzoo.utils import OrderEnforcingWrapper
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from coloc_env.envs.actions import (
     ActionMode,
     Leaves,
-    Pilot,
+    ModeRunner,
+    checked_arrays,
     make_mode,
     observed_leaves,
     privileged_bounds,
@@ -22,7 +24,7 @@ from coloc_env.observation import all_leaves, box, observation_space
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
-from coloc_env.sensing import Sensed
+from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.world import World
 
 RENDER_MODES = ("human", "rgb_array")
@@ -37,7 +39,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     ``[position (m), velocity (m/s), log-std of the position]`` in the world frame, the estimate of
     the state at the very step observed; its reward −‖p̂ − p‖ by default. The horizon truncates; a
     failed UAV terminates. Infos are flat and numeric: ``error`` of the step just scored (m),
-    ``scored``, and the episode's ``episode_rmse``, ``episode_mean``, ``episode_max`` so far.
+    ``scored``, the episode's ``episode_rmse``, ``episode_mean``, ``episode_max`` so far, and the
+    world's ``seed``. What is done to observations in place reaches nobody else.
 
     That is ``action="estimate"``. For learners: ``action="displacement"``, or any ``ActionMode``
     (``coloc_env.envs.actions``), with an action of its own and more leaves.
@@ -68,7 +71,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
         self.mode = make_mode(scenario, action)
-        self._pilot = Pilot(self.mode, self.world)
+        self._runner = ModeRunner(self.mode, self.world)
         space = observation_space(observed_leaves(scenario, self.mode))
         actions = box(self.mode.bounds)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
@@ -95,20 +98,21 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, dict[str, float]]]:
-        """Start an episode: the world of ``seed``; without one, of the seed after the last."""
+        """Start an episode: the world of ``seed``; without one, of the seed after the last (the
+        first time: a random one). Infos have it. ValueError for a seed that is no whole number
+        from 0 to 2⁶²."""
         if seed is None:
-            fresh = int(np.random.SeedSequence().generate_state(1)[0])
-            seed = fresh if self._next_seed is None else self._next_seed
-        self._next_seed = seed + 1
+            seed = random_seed() if self._next_seed is None else self._next_seed
+        self.seed = checked_seed(seed, self.scenario.name)
+        self._next_seed = self.seed + 1
         self.agents = list(self.possible_agents)
-        self.world.reset([seed])
-        self._window = _Window(self.world.sensed)
-        self._tallies = {agent: _Tally() for agent in self.agents}
-        self._static = [list(leaf[0].numpy().copy()) for leaf in self.world.static.values()]
+        self.world.reset([self.seed])
+        self._window = _Window(self.world)
+        self._tallies = {agent: _Tally(self.seed) for agent in self.agents}
         if self._renderer is not None:
             self._renderer.reset()
         infos = {agent: tally.info(0.0, False) for agent, tally in self._tallies.items()}
-        return self._observe(self._pilot.reset()), infos
+        return self._observe(self._runner.reset()), infos
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -127,12 +131,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if not self.agents:
             raise ValueError(f"{self.scenario.name}: the episode is over; call reset() first")
         acting, world = self.agents, self.world
-        estimates = self._pilot.estimate(self._actions_of(actions))
+        estimates = self._runner.estimate(self._actions_of(actions))
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         scored = self._of(self._window.scored[world.cursor])
         step = world.step(estimates)
-        observations = self._observe(self._pilot.observe())
+        observations = self._observe(self._runner.observe())
         errors, rewards = self._of(step.error.tolist()[0]), self._of(step.reward.tolist()[0])
         infos = {a: self._tallies[a].add(errors[a], scored[a]) for a in acting}
         over = self._window.over[world.cursor]
@@ -151,7 +155,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         """Privileged truth: per UAV position, velocity, attitude, alive, scored; then the errors of
         what actions are relative to, if they are."""
         self._started()
-        return self._pilot.state().numpy()[0]
+        return self._runner.state().numpy()[0]
 
     def render(self) -> np.ndarray | None:
         """The scene now: an RGB array [H, W, 3] uint8, or a window (``human``)."""
@@ -179,35 +183,11 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             unknown = [a for a in actions if a not in self._index]
             what = f"no action for {missing[0]}" if missing else f"there is no agent {unknown[0]!r}"
             raise ValueError(f"{self.scenario.name}: {what}; acting now: {', '.join(agents)}")
-        try:
-            stacked = np.array([[actions[a] for a in agents]], dtype=np.float32)
-        except (TypeError, ValueError):
-            raise self._wrong(actions) from None
-        fits = stacked.shape == (1, len(agents), self._pilot.width)
-        if not fits or np.count_nonzero(np.isfinite(stacked)) < stacked.size:
-            raise self._wrong(actions)
+        stacked = checked_arrays(self.scenario, self.mode, actions, agents)
         if len(agents) < count:
-            acting, stacked = stacked, np.zeros((1, count, self._pilot.width), np.float32)
-            stacked[0, [self._index[a] for a in agents]] = acting[0]
-        return torch.from_numpy(stacked)
-
-    def _wrong(self, actions: Mapping[str, np.ndarray]) -> ValueError:
-        """The error that names the first action that does not fit, and what does."""
-        needed = (
-            f"({self._pilot.width},) finite numbers are needed with action={self.mode.name}: "
-            f"{self.mode.meaning}"
-        )
-        for agent in self.agents:
-            what = f"{self.scenario.name}: the action of {agent}"
-            try:
-                action = np.asarray(actions[agent], dtype=np.float32)
-            except (TypeError, ValueError):
-                return ValueError(f"{what} is not numeric; {needed}")
-            if action.shape != (self._pilot.width,):
-                return ValueError(f"{what} has shape {action.shape}; {needed}")
-            if not np.isfinite(action).all():
-                return ValueError(f"{what} holds NaN or infinity; {needed}")
-        raise AssertionError("every action fits")
+            acting, stacked = stacked, np.zeros((count, self._runner.width), np.float32)
+            stacked[[self._index[a] for a in agents]] = acting
+        return torch.from_numpy(stacked).unsqueeze(0)
 
     def _of(self, every: list[T]) -> dict[str, T]:
         """The acting agents' entries of a list of all."""
@@ -216,34 +196,38 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         return {agent: every[self._index[agent]] for agent in self.agents}
 
     def _observe(self, leaves: Leaves) -> dict[str, dict[str, np.ndarray]]:
-        """Each agent's leaves, ``leaves`` of the action mode included: views of a window that the
-        world never writes to again."""
+        """Each agent's leaves, ``leaves`` of the action mode included: rows of copies that nobody
+        else has."""
         world = self.world
         if world.sensed is not self._window.sensed:
-            self._window = _Window(world.sensed)
+            self._window = _Window(world)
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]
+        static = [leaf[world.cursor] for leaf in self._window.static]
         more = [leaf.numpy()[0] for leaf in leaves.values()]
         names = (*self._names, *leaves)
-        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *self._static, *more, strict=True)
+        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *static, *more, strict=True)
         return self._of([dict(zip(names, row, strict=True)) for row in rows])
 
 
 class _Window:
-    """A window of the one world as arrays and lists [K, …], converted once."""
+    """A window of the one world as arrays and lists [K, …], copied once."""
 
-    def __init__(self, sensed: Sensed) -> None:
-        self.sensed = sensed
+    def __init__(self, world: World) -> None:
+        self.sensed = sensed = world.sensed
         self.over: list[bool] = sensed.over.tolist()[0]
         self.scored: list[list[bool]] = sensed.scored.tolist()[0]
         self.failed = sensed.failed.numpy()[0]
-        self.leaves = [leaf.numpy()[0] for leaf in sensed.leaves.values()]
+        self.leaves = [leaf.numpy()[0].copy() for leaf in sensed.leaves.values()]
+        each = (sensed.count, 1, 1)
+        self.static = [np.tile(leaf.numpy(), each) for leaf in world.static.values()]
 
 
 class _Tally:
-    """One UAV's errors in an episode so far: what its infos tell."""
+    """One UAV's errors in an episode so far, for its infos."""
 
-    def __init__(self) -> None:
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
         self._count, self._sum, self._squares, self._largest = 0, 0.0, 0.0, 0.0
 
     def add(self, error: float, scored: bool) -> dict[str, float]:
@@ -262,7 +246,16 @@ class _Tally:
             "episode_rmse": math.sqrt(self._squares / count),
             "episode_mean": self._sum / count,
             "episode_max": self._largest,
+            "seed": self._seed,
         }
+
+
+class _Cycle(parallel_to_aec_wrapper):
+    """PettingZoo's agent-environment cycle, each observation of which is a copy."""
+
+    def observe(self, agent: str) -> dict[str, np.ndarray]:
+        """What the agent observes until all have acted."""
+        return {name: leaf.copy() for name, leaf in super().observe(agent).items()}
 
 
 def parallel_env(
@@ -282,4 +275,5 @@ def env(
     **overrides: Any,
 ) -> AECEnv:
     """The same environment in PettingZoo's agent-environment-cycle form."""
-    return parallel_to_aec(parallel_env(scenario, render_mode, action, **overrides))
+    made = parallel_env(scenario, render_mode, action, **overrides)
+    return OrderEnforcingWrapper(_Cycle(made))

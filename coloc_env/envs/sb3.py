@@ -11,23 +11,30 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
-from coloc_env.envs.actions import ActionMode, Pilot, chosen_leaves, make_mode
+from coloc_env.envs.actions import (
+    ActionMode,
+    ModeRunner,
+    checked_tensor,
+    chosen_leaves,
+    make_mode,
+)
 from coloc_env.observation import box, flat_box
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
+from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.world import World
 
 Array = NDArray[np.float32]
 
 
-class Slot:
+class SubEnv:
     """One UAV of one world, as ``get_attr``, ``set_attr`` and ``env_method`` see it."""
 
     def __init__(self, env: "CoLocVecEnv", world: int, uav: int) -> None:
         self._env, self.world, self.uav = env, world, uav
         self.agent, self.scenario = f"uav_{uav}", env.scenario
-        self.render_mode = env.mode_of_rendering
+        self.render_mode = env.render_mode_used
 
     @property
     def seed(self) -> int:
@@ -37,7 +44,7 @@ class Slot:
     def state(self) -> Array:
         """The privileged state of its world."""
         self._env.started()
-        return self._env.pilot.state()[self.world].numpy().copy()
+        return self._env.runner.state()[self.world].numpy().copy()
 
 
 class CoLocVecEnv(VecEnv):
@@ -47,9 +54,10 @@ class CoLocVecEnv(VecEnv):
     (default: those that the action mode recommends, else all). ``action``: ``estimate``,
     ``displacement`` or an ``ActionMode`` (``agents.with_base(env, "ekf")`` for corrections on a
     localizer). At the horizon every environment is truncated (``TimeLimit.truncated``,
-    ``terminal_observation``) and starts anew. World b starts with seed ``seed + b``, and moves on
+    ``terminal_observation``) and restarts. World b starts with seed ``seed + b``, and moves on
     by ``num_worlds`` an episode; ``seed(s)`` sets that for the next ``reset()``. (So does
-    stable-baselines3's ``PPO(seed=s)``: call ``seed`` after making the model.)
+    stable-baselines3's ``PPO(seed=s)``: call ``seed`` after making the model.) Without ``seed`` the
+    first is random; ``first_seed`` and each environment's ``reset_infos["seed"]`` say which.
 
     Raises ValueError where UAVs can fail: those of one world end together.
     """
@@ -58,7 +66,7 @@ class CoLocVecEnv(VecEnv):
         self,
         scenario: str | Scenario = "indoor-v0",
         num_worlds: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         action: str | ActionMode = "estimate",
         leaves: Sequence[str] | None = None,
         render_mode: str | None = None,
@@ -69,60 +77,63 @@ class CoLocVecEnv(VecEnv):
             raise ValueError(f"render_mode={render_mode!r} is not allowed: None, rgb_array")
         self.scenario, self.mode = scenario, make_mode(scenario, action)
         self.world = World(scenario, num_worlds)
-        self.pilot = Pilot(self.mode, self.world)
+        self.runner = ModeRunner(self.mode, self.world)
         chosen = chosen_leaves(scenario, self.mode, leaves)
         self.leaves, self._wanted = tuple(chosen), leaves
         self.worlds, self.n_uavs = num_worlds, scenario.arena.n_uavs
-        self.mode_of_rendering = render_mode
+        self.render_mode_used = render_mode
         self._renderer = None if render_mode is None else Renderer(scenario)
         pairs = [(b, i) for b in range(num_worlds) for i in range(self.n_uavs)]
-        self.slots = [Slot(self, b, i) for b, i in pairs]
-        self._first_seed = self._next_seed = seed
-        super().__init__(len(self.slots), flat_box(chosen), box(self.mode.bounds))
+        self.sub_envs = [SubEnv(self, b, i) for b, i in pairs]
+        given = random_seed() if seed is None else checked_seed(seed, scenario.name)
+        self.first_seed = self._next_seed = given
+        super().__init__(len(self.sub_envs), flat_box(chosen), box(self.mode.bounds))
 
     def with_action(self, action: str | ActionMode) -> "CoLocVecEnv":
         """The same environment, from its first episode on, in another action mode."""
         return CoLocVecEnv(
             self.scenario,
             self.worlds,
-            self._first_seed,
+            self.first_seed,
             action,
             self._wanted,
-            self.mode_of_rendering,
+            self.render_mode_used,
         )
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Take the worlds of seeds ``seed``, ``seed + 1``, … at the next reset (None: as if nothing
-        were said); the world's seed for each environment."""
+        """Take the worlds of seeds ``seed``, ``seed + 1``, … at the next reset (None: go on as
+        before); the world's seed for each environment."""
         if seed is not None:
-            self._next_seed = seed
-        return [self._next_seed + slot.world for slot in self.slots]
+            self._next_seed = checked_seed(seed, self.scenario.name)
+        return [self._next_seed + sub_env.world for sub_env in self.sub_envs]
 
     def reset(self) -> Array:
         self.world.reset(self._next_seed)
         self._next_seed += self.worlds
+        seeds = self.world.seeds.tolist()
+        self.reset_infos = [{"seed": seeds[sub_env.world]} for sub_env in self.sub_envs]
         if self._renderer is not None:
             self._renderer.reset()
-        return self._flat(self.pilot.reset())
+        return self._flat(self.runner.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
         self.started()
-        shape = (self.num_envs, self.pilot.width)
-        actions = np.asarray(actions, np.float32)
-        if actions.shape != shape or not np.isfinite(actions).all():
+        rows = np.array(actions)
+        if rows.shape != (self.num_envs, self.runner.width) or rows.dtype.kind not in "fiub":
             raise ValueError(
-                f"{self.scenario.name}: finite actions of shape {shape} are needed, each "
-                f"{self.mode.meaning}; got shape {actions.shape}"
+                f"{self.scenario.name}: real numbers of shape {(self.num_envs, self.runner.width)} "
+                f"are needed, each row {self.mode.meaning}; got {rows.dtype} of shape {rows.shape}"
             )
-        self._actions = torch.from_numpy(actions).view(self.worlds, self.n_uavs, -1)
+        each = torch.from_numpy(rows.astype(np.float32)).view(self.worlds, self.n_uavs, -1)
+        self._actions = checked_tensor(self.scenario, self.mode, each, self.worlds)
 
     def step_wait(self) -> VecEnvStepReturn:
-        estimates = self.pilot.estimate(self._actions)
+        estimates = self.runner.estimate(self._actions)
         if self._renderer is not None:
             self._renderer.record(self.world, estimates[:1])
         step = self.world.step(estimates)
-        observation = self._flat(self.pilot.observe())
-        infos: list[dict[str, Any]] = [{} for _ in self.slots]
+        observation = self._flat(self.runner.observe())
+        infos: list[dict[str, Any]] = [{} for _ in self.sub_envs]
         over = bool(step.truncated[0])  # worlds start and end together
         if over:
             for info, last in zip(infos, observation, strict=True):
@@ -137,11 +148,11 @@ class CoLocVecEnv(VecEnv):
             self._renderer.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self.slots[i], attr_name) for i in self._get_indices(indices)]
+        return [getattr(self.sub_envs[i], attr_name) for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         for i in self._get_indices(indices):
-            setattr(self.slots[i], attr_name, value)
+            setattr(self.sub_envs[i], attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any

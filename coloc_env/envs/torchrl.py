@@ -1,23 +1,27 @@
-"""The TorchRL face: many worlds at once as an ``EnvBase`` with one group of agents, ``uav``."""
+"""The TorchRL face: many worlds at once, as one group of agents, or each UAV a row of its own."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coloc_env.envs.actions import (
     ActionMode,
     Leaves,
-    Pilot,
-    check,
+    ModeRunner,
+    checked_tensor,
+    chosen_leaves,
     make_mode,
     observed_leaves,
     privileged_bounds,
 )
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
+from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.sensing import Sensed
 from coloc_env.world import World
 
@@ -32,7 +36,8 @@ class CoLocEnv(EnvBase):
     a world in which every UAV failed terminates.
 
     Row b of the first episode is the world of seed ``seed + b``, of the next one
-    ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's.
+    ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's. Without ``seed``
+    the first is random; ``first_seed`` says which, ``world.seeds`` [B] those of the worlds now.
 
     ``action``: ``estimate`` (a localizer's), ``displacement``, or an ``ActionMode``; see
     ``coloc_env.envs.actions``.
@@ -43,7 +48,7 @@ class CoLocEnv(EnvBase):
         scenario: str | Scenario = "indoor-v0",
         num_envs: int = 1,
         device: str | torch.device = "cpu",
-        seed: int = 0,
+        seed: int | None = None,
         action: str | ActionMode = "estimate",
         **overrides: Any,
     ) -> None:
@@ -52,9 +57,9 @@ class CoLocEnv(EnvBase):
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)
         self.mode = make_mode(scenario, action)
-        self._pilot = Pilot(self.mode, self.world)
+        self._runner = ModeRunner(self.mode, self.world)
         self._sensed: Sensed | None = None
-        self._set_seed(seed)
+        self._set_seed(random_seed() if seed is None else seed)
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -66,7 +71,8 @@ class CoLocEnv(EnvBase):
             for name, leaf in observed_leaves(self.scenario, self.mode).items()
         }
         low, high = (
-            torch.tensor(x, device=device) for x in privileged_bounds(self.scenario, self.mode)
+            torch.tensor(x, dtype=torch.float32, device=device)
+            for x in privileged_bounds(self.scenario, self.mode)
         )
         self.observation_spec = Composite(
             uav=Composite(
@@ -74,11 +80,13 @@ class CoLocEnv(EnvBase):
                 mask=Categorical(2, (b, n), device, dtype=torch.bool),
                 shape=(b, n),
             ),
-            state=Bounded(low.expand(b, -1), high.expand(b, -1), (b, len(low)), device),
+            state=Bounded(
+                low.expand(b, -1), high.expand(b, -1), (b, len(low)), device, torch.float32
+            ),
             shape=(b,),
         )
-        low, high = (torch.tensor(x, device=device) for x in self.mode.bounds)
-        shape = (b, n, self._pilot.width)
+        low, high = (torch.tensor(x, dtype=torch.float32, device=device) for x in self.mode.bounds)
+        shape = (b, n, self._runner.width)
         action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
         self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
         reward = Unbounded((b, n, 1), device, torch.float32)
@@ -91,13 +99,13 @@ class CoLocEnv(EnvBase):
     def with_action(self, action: str | ActionMode) -> "CoLocEnv":
         """The same environment, from the seed that it was given last, in another action mode."""
         b = self.batch_size[0]
-        return CoLocEnv(self.scenario, b, self.device, self._first_seed, action)
+        return CoLocEnv(self.scenario, b, self.device, self.first_seed, action)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
+            self.first_seed = checked_seed(seed, self.scenario.name)
             rows = torch.arange(self.batch_size[0], device=self.device)
-            self._seeds = int(seed) + rows
-            self._first_seed = int(seed)
+            self._seeds = self.first_seed + rows
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         rows = None
@@ -106,13 +114,13 @@ class CoLocEnv(EnvBase):
         self.world.reset(self._seeds, rows)
         moved = self._seeds + self.batch_size[0]
         self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
-        return self._observe(self._pilot.reset(rows)).copy()
+        return self._observe(self._runner.reset(rows)).copy()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]
-        check(self.scenario, self.mode, action, self.batch_size[0])
-        step = self.world.step(self._pilot.estimate(action))
-        out = self._observe(self._pilot.observe())
+        action = checked_tensor(self.scenario, self.mode, action, self.batch_size[0])
+        step = self.world.step(self._runner.estimate(action))
+        out = self._observe(self._runner.observe())
         out["uav"].set("reward", step.reward.unsqueeze(-1))
         return out
 
@@ -128,11 +136,12 @@ class CoLocEnv(EnvBase):
         observation.set("message_mask", heard)
         for name, leaf in leaves.items():
             observation.set(name, leaf)
-        out.set("state", self._pilot.state())
+        out.set("state", self._runner.state())
         return out
 
     def _window(self, sensed: Sensed) -> TensorDict:
-        """A window of steps [B, K], made once: building a TensorDict a step costs more."""
+        """A window of steps [B, K], copied once: building a TensorDict a step costs more. What is
+        done to an observation in place reaches no other step, and not the world."""
         shape = (*sensed.steps.shape, self.scenario.arena.n_uavs)
         static = {
             name: leaf.unsqueeze(1).expand(*shape, -1) for name, leaf in self.world.static.items()
@@ -150,4 +159,77 @@ class CoLocEnv(EnvBase):
             },
             shape[:2],
             self.device,
+        ).clone()
+
+
+class PerUavEnv(EnvBase):
+    """A ``CoLocEnv`` of B worlds and N UAVs as one of B · N rows, world by world.
+
+    Keys: ``observation`` [B·N, F], the ``leaves`` side by side (default: those that the action mode
+    recommends, else all); ``state`` [B·N, S], the world's privileged state once for each of its
+    UAVs; ``action`` [B·N, A]; ``reward``, ``done``, ``terminated``, ``truncated`` [B·N, 1]. So
+    TorchRL's recurrent modules and single-agent losses apply, with shared parameters.
+
+    Raises ValueError where UAVs can fail: rows of one world end together.
+    """
+
+    def __init__(self, env: CoLocEnv, leaves: Sequence[str] | None = None) -> None:
+        chosen = chosen_leaves(env.scenario, env.mode, leaves)
+        self.worlds, self.n_uavs = env.batch_size[0], env.scenario.arena.n_uavs
+        rows = self.worlds * self.n_uavs
+        super().__init__(device=env.device, batch_size=torch.Size([rows]))
+        self.env, self.scenario, self.mode, self.leaves = env, env.scenario, env.mode, tuple(chosen)
+        width = sum(leaf.width for leaf in chosen.values())
+        states = env.observation_spec["state"].shape[-1]
+        self.observation_spec = Composite(
+            observation=Unbounded((rows, width), self.device, torch.float32),
+            state=Unbounded((rows, states), self.device, torch.float32),
+            shape=(rows,),
         )
+        action = env.full_action_spec["uav", "action"]
+        flat = action.space.low.flatten(0, 1), action.space.high.flatten(0, 1)
+        self.action_spec = type(action)(*flat, flat[0].shape, self.device, torch.float32)
+        self.reward_spec = Unbounded((rows, 1), self.device, torch.float32)
+        flag = Binary(1, (rows, 1), self.device, torch.bool)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(rows,)
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env.set_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        wanted = None
+        if tensordict is not None and "_reset" in tensordict.keys():  # noqa: SIM118
+            rows = tensordict["_reset"].view(self.worlds, self.n_uavs)
+            worlds = rows.any(-1, keepdim=True)
+            if not bool((rows == worlds).all()):
+                raise ValueError("the UAVs of a world restart together, not one by one")
+            wanted = TensorDict({"_reset": worlds}, [self.worlds], self.device)
+        return self._flat(self.env._reset(wanted))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].unflatten(0, (self.worlds, self.n_uavs))
+        uav = TensorDict({"action": action}, action.shape[:2], self.device)
+        after = self.env._step(TensorDict({"uav": uav}, [self.worlds], self.device))
+        out = self._flat(after)
+        out.set("reward", after["uav", "reward"].flatten(0, 1))
+        return out
+
+    def _flat(self, entries: TensorDictBase) -> TensorDictBase:
+        """A step's entries, a row per UAV."""
+        seen = entries["uav", "observation"]
+        observation = torch.cat([seen[name] for name in self.leaves], -1)
+        flags = ("done", "terminated", "truncated")
+        return TensorDict(
+            {
+                "observation": observation.flatten(0, 1),
+                **{name: self._each(entries[name]) for name in ("state", *flags)},
+            },
+            self.batch_size,
+            self.device,
+        )
+
+    def _each(self, entry: Tensor) -> Tensor:
+        """A world's entry [B, F] once for each of its UAVs."""
+        return entry.repeat_interleave(self.n_uavs, 0)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_SMALL = 1.0  # rad²; up to here the terms below are all that float64 can tell
+_SMALL = 1.0  # rad²; up to here the terms below are all that float64 resolves
 _TERMS = 9
 # |B_2|, |B_4|, …, |B_20|, the Bernoulli numbers
 _BERNOULLI = (

@@ -34,13 +34,18 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Arena:
-    """What a motion may know of its scenario: the box it flies in (m), team size and step (s)."""
+    """What a motion may know of its scenario: the box it flies in (m), team size and step (s).
+
+    ``origin``: where the zero of all positions is in the frame that was recorded (m), for files;
+    empty: there is no other frame.
+    """
 
     dim: int
     n_uavs: int
     dt: float
     low: tuple[float, ...]
     high: tuple[float, ...]
+    origin: tuple[float, ...] = ()
 
     @property
     def centre(self) -> tuple[float, ...]:

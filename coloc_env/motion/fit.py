@@ -23,7 +23,7 @@ def interval(motion: Motion, setting: str, zero: bool = False) -> tuple[float, f
 
 
 def at_most(motion: Motion, setting: str, value: float, limit: float, arena: Arena) -> float:
-    """``value`` if it is allowed. ``setting`` may say how the value comes about."""
+    """``value`` if it is allowed. ``setting`` may explain how the value comes about."""
     if not value <= limit * (1 + 1e-12):
         raise ValueError(
             f"{_name(motion, setting)} = {value:g} does not fit the arena of {_size(arena)}: "

@@ -1,4 +1,4 @@
-"""Straight legs flown back and forth or around a square, with smooth stops where they turn."""
+"""Straight legs back and forth or around a square, with smooth stops where they turn."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _SPEED = 0.5
 
 @dataclass(frozen=True)
 class Line(Motion):
-    """Parallel lanes along x, flown back and forth at constant speed; UAVs turn round at rest.
+    """Parallel lanes along x, back and forth at constant speed; UAVs turn round at rest.
 
     Lanes are spread evenly over the arena's width, and over its height in a mixed order; UAV i is
     i / N of a round trip ahead: the team is never in one plane. Peak acceleration

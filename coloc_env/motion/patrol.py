@@ -20,8 +20,8 @@ from coloc_env.motion.waypoints import leg_flight
 class Patrol(Motion):
     """Minimum-jerk flights, all of one duration, between points in boxes, with a rest in each.
 
-    A round visits the ``stations`` (boxes, m) that one of ``routes`` numbers, drawn anew for every
-    UAV and round; all routes are equally long. The point in a station is drawn anew for every
+    A round visits the ``stations`` (boxes, m) that one of ``routes`` numbers, drawn for every
+    UAV and round; all routes are equally long. The point in a station is drawn for every
     visit. UAVs start spread over a round and take no notice of each other. Legs are straight, so
     what lies beyond a plane from both of a leg's stations is never crossed. Yaw along the leg; it
     turns at rest.
@@ -41,8 +41,8 @@ class Patrol(Motion):
                 f"Patrol: routes = {self.routes} must be equally long lists of station numbers "
                 f"from 0 to {len(self.stations) - 1}"
             )
-        begun = uniform(keys, "motion.patrol.begun", 1) + phases(keys, arena.n_uavs, arena.n_uavs)
-        return {"keys": uav_keys(keys, arena.n_uavs), "legs": len(self.routes[0]) * begun}
+        start = uniform(keys, "motion.patrol.begun", 1) + phases(keys, arena.n_uavs, arena.n_uavs)
+        return {"keys": uav_keys(keys, arena.n_uavs), "legs": len(self.routes[0]) * start}
 
     def advance(
         self, carry: Carry, steps: Int64[Tensor, "R K"], arena: Arena

@@ -20,7 +20,7 @@ _FASTEST = 50.0
 class RandomVelocity(Motion):
     """Each UAV's velocity follows a target, speed uniform in [0, v_max], direction uniform.
 
-    The target is drawn anew in a step with probability dt / ``interval``; the velocity follows with
+    The target is redrawn in a step with probability dt / ``interval``; the velocity follows with
     a first-order lag, integrated exactly. With an infinite ``interval`` the first target is kept:
     straight lines at constant speed, but for the walls. Start positions are uniform in the arena;
     the velocity starts on its target. The x axis turns towards the horizontal velocity with the

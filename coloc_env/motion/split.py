@@ -45,7 +45,7 @@ class Split(Motion):
         inside(self, "approach", (self._space(),), arena)
         n, per_team = arena.n_uavs, (arena.n_uavs + 1) // 2
         number = torch.arange(n, device=keys.device)
-        second, place = number >= per_team, number.remainder(per_team)
+        second, place = number >= per_team, number.remainder(per_team).to(torch.float32)
         toss = uniform(keys, "motion.split", 1) - 0.5
         drawn = uniform(uav_keys(keys, n), "motion.split.wobble", 4)
         return {

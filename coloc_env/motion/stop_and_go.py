@@ -1,4 +1,4 @@
-"""A circle flown in bursts."""
+"""A circle in bursts."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Groups of UAVs that interweave: figures of eight through one point, flown in both senses."""
+"""Groups of UAVs that interweave: figures of eight through one point, in both senses."""
 
 import math
 from dataclasses import dataclass

@@ -83,10 +83,10 @@ class Target:
         axes.axis("off")
         axes.set_xlim(-1.04, 1.04)
         axes.set_ylim(-1.04, 1.04)
-        look: dict[str, Any] = {"closed": True, "linewidths": 0.9}
+        options: dict[str, Any] = {"closed": True, "linewidths": 0.9}
         rings = [radius * disc(90) for radius in (1.0, 0.5)]
         axes.add_collection(
-            PolyCollection(rings, facecolors=style.FLOOR, edgecolors=style.RULE, **look)
+            PolyCollection(rings, facecolors=style.FLOOR, edgecolors=style.RULE, **options)
         )
         cross = [[(-1, 0), (1, 0)], [(0, -1), (0, 1)]]
         axes.add_collection(LineCollection(cross, colors=style.RULE, linewidths=0.9))

@@ -12,7 +12,7 @@ from coloc_env.scenario import Scenario
 
 
 class Key:
-    """Says what the marks mean; made anew only when one of its words changes."""
+    """The meaning of the marks; drawn again only when one of its words changes."""
 
     def __init__(self, figure: Figure, scenario: Scenario) -> None:
         self._figure, self._scenario = figure, scenario
@@ -77,8 +77,8 @@ class Key:
         if landmarks:
             items.append(_mark("landmark", "D", 5, color=style.LANDMARK))
         if anchors:
-            look = {"markerfacecolor": "white", "markeredgecolor": style.INK}
-            items.append(_mark("anchor", "^", 7, **look))
+            options = {"markerfacecolor": "white", "markeredgecolor": style.INK}
+            items.append(_mark("anchor", "^", 7, **options))
         if (landmarks or anchors) and watching >= 0:
             dots = {"linestyle": (0, (1, 2.2)), "linewidth": 1.2}
             items.append(_stroke(f"seen by UAV {watching}", color=colour, **dots))
@@ -87,9 +87,9 @@ class Key:
         return items
 
 
-def _mark(label: str, marker: str, size: float, **look: Any) -> Line2D:
-    return Line2D([], [], linestyle="none", marker=marker, markersize=size, label=label, **look)
+def _mark(label: str, marker: str, size: float, **options: Any) -> Line2D:
+    return Line2D([], [], linestyle="none", marker=marker, markersize=size, label=label, **options)
 
 
-def _stroke(label: str, **look: Any) -> Line2D:
-    return Line2D([], [], label=label, **look)
+def _stroke(label: str, **options: Any) -> Line2D:
+    return Line2D([], [], label=label, **options)

@@ -10,7 +10,7 @@ from coloc_env.render.charts import ErrorStrip, Target
 from coloc_env.render.header import Header
 from coloc_env.render.history import History
 from coloc_env.render.legend import Key
-from coloc_env.render.scene import Scene, Sizes
+from coloc_env.render.scene import MapPanel, Sizes
 from coloc_env.render.shapes import HEIGHT, WIDTH, nice, plan, tilted
 from coloc_env.render.snapshot import Snapshot
 from coloc_env.scenario import Scenario
@@ -26,7 +26,7 @@ class Picture:
         self._figure, self._scenario = figure, scenario
         self._deep = scenario.arena.dim == 3
         with matplotlib.style.context(["default", style.FONT]):
-            self._scenes = self._add_scenes()
+            self._panels = self._add_panels()
             self._strip = self._add_strip()
             self._target = self._add_target()
             self._header = Header(figure, scenario)
@@ -35,8 +35,8 @@ class Picture:
     def update(self, snapshot: Snapshot, history: History, alive: np.ndarray) -> None:
         """Show ``snapshot`` with the ``history`` up to it; UAVs not in ``alive`` [N] as failed."""
         exaggeration = self._exaggeration(snapshot)
-        for scene in self._scenes:
-            scene.update(snapshot, history, alive, exaggeration)
+        for panel in self._panels:
+            panel.update(snapshot, history, alive, exaggeration)
         self._strip.update(history)
         self._target.update(snapshot, alive)
         self._header.update(snapshot, history)
@@ -45,7 +45,7 @@ class Picture:
 
     def _exaggeration(self, snapshot: Snapshot) -> float:
         """By how much ellipses must grow to stand out from the markers, a round number ≥ 1."""
-        sizes = self._scenes[0].pixels(snapshot.std)
+        sizes = self._panels[0].pixels(snapshot.std)
         sizes = sizes[np.isfinite(sizes)]
         if not len(sizes):
             return 1.0
@@ -61,18 +61,18 @@ class Picture:
         place = (left / WIDTH, bottom / HEIGHT, width / WIDTH, height / HEIGHT)
         return self._figure.add_axes(place)
 
-    def _add_scenes(self) -> list[Scene]:
+    def _add_panels(self) -> list[MapPanel]:
         scenario = self._scenario
         arena = scenario.arena
         dim = plan(arena.dim)
         if not self._deep:
             axes = self._axes(24, 262, 760, 400, "Map")
-            return [Scene(axes, scenario, dim, (760, 400), large=True)]
+            return [MapPanel(axes, scenario, dim, (760, 400), large=True)]
         view = tilted(arena)
         axes = self._axes(24, 252, 760, 410, "Room")
-        large = Scene(axes, scenario, view, (760, 410), large=True)
+        large = MapPanel(axes, scenario, view, (760, 410), large=True)
         axes = self._axes(812, 402, 364, 260, "From above")
-        return [large, Scene(axes, scenario, dim, (364, 260), large=False)]
+        return [large, MapPanel(axes, scenario, dim, (364, 260), large=False)]
 
     def _add_strip(self) -> ErrorStrip:
         axes = self._axes(76, 78, 708, 140, "Position error")

@@ -44,7 +44,7 @@ class Sizes:
         return Sizes(3.6, 1.6, 0.0) if large else Sizes(2.4, 1.0, 0.0)
 
 
-class Scene:
+class MapPanel:
     """One view of the world on an axes of ``size`` px; ``update`` moves its artists in place."""
 
     def __init__(
@@ -90,9 +90,9 @@ class Scene:
         self._lines(edges[top], colors=style.RULE, linewidths=0.9, zorder=0.2)
         for wall in scenario.network.walls:
             box = corners(_box(wall[0]), _box(wall[1]))
-            look: dict[str, Any] = {"facecolors": (*style.rgb(style.WALL), 0.28), "zorder": 3.0}
+            options: dict[str, Any] = {"facecolors": (*style.rgb(style.WALL), 0.28), "zorder": 3.0}
             shown = BOX_FACES if self._deep else BOX_FACES[1:2]
-            self._polygons(list(box[shown]), edgecolors=style.WALL, linewidths=0.7, **look)
+            self._polygons(list(box[shown]), edgecolors=style.WALL, linewidths=0.7, **options)
 
     def _grid(self) -> np.ndarray:
         """Lines [M, 2, 3] on the floor, ``spacing`` apart."""
@@ -110,13 +110,13 @@ class Scene:
         """Distance of the floor's grid lines, m."""
         return nice(float((self._high - self._low)[:2].max()) / 12)
 
-    def _polygons(self, faces: list[np.ndarray], **look: Any) -> None:
+    def _polygons(self, faces: list[np.ndarray], **options: Any) -> None:
         self._axes.add_collection(
-            PolyCollection([self._flat(f) for f in faces], **look), autolim=False
+            PolyCollection([self._flat(f) for f in faces], **options), autolim=False
         )
 
-    def _lines(self, lines: np.ndarray, **look: Any) -> LineCollection:
-        made = LineCollection(list(self._flat(lines)), **look)
+    def _lines(self, lines: np.ndarray, **options: Any) -> LineCollection:
+        made = LineCollection(list(self._flat(lines)), **options)
         self._axes.add_collection(made, autolim=False)
         return made
 
@@ -169,14 +169,14 @@ class Scene:
         self._crosses = self._dots(
             "X", (2.0 * sizes.marker) ** 2 / 2, 5.1, facecolor=colours, edgecolor="white"
         )
-        look: dict[str, Any] = {"color": "white", "weight": "bold", "zorder": 6.0}
-        look |= {"ha": "center", "va": "center_baseline", "fontsize": sizes.numbers or 1.0}
+        options: dict[str, Any] = {"color": "white", "weight": "bold", "zorder": 6.0}
+        options |= {"ha": "center", "va": "center_baseline", "fontsize": sizes.numbers or 1.0}
         count = n_uavs if sizes.numbers else 0
-        self._numbers = [self._axes.text(0, 0, str(i), **look) for i in range(count)]
+        self._numbers = [self._axes.text(0, 0, str(i), **options) for i in range(count)]
 
-    def _dots(self, marker: str, area: float, zorder: float, **look: Any) -> PathCollection:
+    def _dots(self, marker: str, area: float, zorder: float, **options: Any) -> PathCollection:
         dots = self._axes.scatter([], [], s=area, marker=marker, zorder=zorder, linewidths=1.1)
-        dots.set(**look)
+        dots.set(**options)
         return dots
 
     # ---------------------------------------------------------------- one frame
@@ -187,17 +187,17 @@ class Scene:
         """Show ``snapshot``; UAVs not in ``alive`` [N] as crosses where they were seen last;
         2-σ ellipses ``exaggeration`` times as large as they are."""
         view = self._view
-        flying = np.where(alive[:, None], snapshot.position, np.nan)
-        at = view(flying)
+        alive_at = np.where(alive[:, None], snapshot.position, np.nan)
+        at = view(alive_at)
         here = np.isfinite(at[:, 0])
         self._landmarks.set_offsets(view(snapshot.landmarks))
         self._anchors.set_offsets(view(snapshot.anchors))
         self._seen.set_offsets(view(snapshot.seen))
-        self._show_links(snapshot, flying)
+        self._show_links(snapshot, alive_at)
         self._truth.set_segments(list(_pieces(view(history.truth))))
         self._guess.set_segments(list(_pieces(view(history.estimate))))
         if self._deep:
-            foot = flying.copy()
+            foot = alive_at.copy()
             foot[:, 2] = self._low[2]
             self._stems.set_segments(list(np.stack((at, view(foot)), 1)))
         known = np.isfinite(snapshot.estimate[:, 0]) & alive
@@ -212,8 +212,8 @@ class Scene:
             number.set_visible(bool(shown))
             number.set_position(place)
 
-    def _show_links(self, snapshot: Snapshot, flying: np.ndarray) -> None:
-        ends = self._view(flying)
+    def _show_links(self, snapshot: Snapshot, alive_at: np.ndarray) -> None:
+        ends = self._view(alive_at)
         self._links.set_segments(list(ends[snapshot.links]))
         seen = self._view(snapshot.seen)
         start = np.broadcast_to(ends[snapshot.watching], seen.shape)

@@ -58,7 +58,7 @@ def nice(value: float) -> float:
 
 
 def corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The corners [8, 3] of a box; bit ``a`` of a corner's index says which end of axis ``a``."""
+    """The corners [8, 3] of a box; bit ``a`` of a corner's index is which end of axis ``a``."""
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     return np.where(bits, high, low)
 

@@ -1,4 +1,4 @@
-"""Colours, type and sizes: one look for all panels."""
+"""Colours, type and sizes, the same for all panels."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ FONT = {
     "mathtext.default": "rm",
 }
 
-# Okabe and Ito's colours without yellow and black, then two of Tol's: told apart by all eyes.
+# Okabe and Ito's colours without yellow and black, then two of Tol's: distinct to all eyes.
 _UAVS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#7F7F1F")
 
 

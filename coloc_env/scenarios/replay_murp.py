@@ -1,25 +1,18 @@
 """``replay-murp-v0``: three agents that measure poses relative to each other by 36 UWB ranges."""
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import permutations
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float64
-from torch import Tensor
 
-from coloc_env.datasets import DataError, Recording
-from coloc_env.datasets.antenna_arrays import relative_poses
 from coloc_env.datasets.grid import Grid, common_grid
-from coloc_env.datasets.replay import arena_of, lever_arms, recorded_motion, recorded_ranges
-from coloc_env.geometry import Se3
+from coloc_env.datasets.murp_poses import DT, solved
+from coloc_env.datasets.replay import arena_of, recorded_motion
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, Prior, Scenario
-from coloc_env.scenarios.replay import cut, loaded
-from coloc_env.sensors import Odometry, Ranging, RecordedPoses, Reference, RelativePose
-from coloc_env.series import Tape
+from coloc_env.options import Degrees, Metres, Seconds, Share
+from coloc_env.scenario import ConstantVelocity, Prior, Reward, Scenario
+from coloc_env.scenarios.parts.replays import RecordingOptions
+from coloc_env.sensors import Odometry, RecordedPoses, Reference, RelativePose
+from coloc_env.series import Series
 
 _DT = 1.0  # s: the recording has one row a second
 _HEIGHT_STD, _TILT_STD = 0.1, 0.05  # m, rad: of what is believed of the agents' heights and tilts
@@ -59,7 +52,7 @@ def solved(recording: Recording, steps: int) -> Solved:
         Se3.act(truth.unsqueeze(-2), arms[second]).unsqueeze(-3) - arms[first].unsqueeze(-2), dim=-1
     )
     measured, known = ranges[:, first, second], there[:, first, second]
-    bias, std = torch.empty(len(pairs)).double(), torch.empty(len(pairs)).double()
+    bias, std = torch.empty(2, len(pairs), dtype=torch.float64)
     for pair, (i, j) in enumerate(pairs):
         both = [pair, pairs.index((j, i))]
         error = (measured - clean)[:steps, both][known[:steps, both]]
@@ -90,45 +83,43 @@ def solved(recording: Recording, steps: int) -> Solved:
 
 def replay_murp(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    calibration: float = 60.0,
-    outliers: float = 0.0,
-    odometry_noise: tuple[float, float] = (0.02, 0.6),
-    relative_pose_noise: tuple[float, float] | None = None,
+    calibration: Seconds = 60.0,
+    outliers: Share = 0.0,
+    odometry_noise: tuple[Metres, Degrees] = (0.02, 0.6),
+    relative_pose_noise: tuple[Metres, Degrees] | None = None,
+    reward: Reward = "error",
+    replay: RecordingOptions = RecordingOptions(),
 ) -> Scenario:
     """Three agents with six UWB antennas each for some minutes, a step each second (MURP): at every
-    step each ordered pair learns the relative pose that its 36 ranges say, by both ends.
+    step both of each ordered pair learn the relative pose that was solved from their 36 ranges.
 
     Agents are level to a few degrees and keep their heights, and are believed to: their antennas,
-    all in one plane, cannot tell a pose from its mirror image. Heights, the ranges' biases and the
-    poses' noise (``relative_pose_noise`` in m and degrees, if it is not given) are what the first
-    ``calibration`` s say, which are not replayed (``span`` counts from their end).
+    all in one plane, cannot distinguish a pose from its mirror image. Heights, the ranges' biases
+    and the poses' noise (``relative_pose_noise`` in m and degrees, if it is not given) are those of
+    the first ``calibration`` s, which are not replayed (``span`` counts from their end).
     Simulated: odometry along the true path, with noise of ``odometry_noise`` (m and degrees a
     step, about that of a visual-inertial odometry), and ``outliers``, the share of poses that are
     replaced by others, drawn uniformly from the area and all rotations. Poses are relative to agent
     0's, as in ``stein3d-v0``; the team believes all but the outliers.
     """
-    recording = loaded("murp", sequence, data)
-    whole = common_grid(recording, _DT, ())
-    if not 10.0 <= calibration <= (whole.count - 2) * _DT:
+    recording = replay.load("murp")
+    whole = common_grid(recording, DT, ())
+    if not 10.0 <= calibration <= (whole.count - 2) * DT:
         raise ValueError(
-            f"calibration={calibration} is not allowed: from 10 s to {(whole.count - 2) * _DT:g}"
+            f"calibration={calibration} is not allowed: from 10 s to {(whole.count - 2) * DT:g}"
         )
-    steps = round(calibration / _DT)
+    steps = round(calibration / DT)
     found = solved(recording, steps)
-    grid = cut(Grid(int(whole.times[steps]), _DT, whole.count - steps), span)
+    grid = replay.cut(Grid(int(whole.times[steps]), DT, whole.count - steps))
     at = np.searchsorted(whole.times, grid.times)
     std, turn_std = found.std, found.turn_std
     if relative_pose_noise is not None:
         std, turn_std = relative_pose_noise[0], math.radians(relative_pose_noise[1])
-    slip, turn = odometry_noise[0] / _DT, math.radians(odometry_noise[1]) / _DT
-    odometry, reference = Odometry(slip, slip, turn), Reference()
+    odometry, reference = Odometry.of_steps(odometry_noise, DT), Reference()
     matches = RelativePose(len(found.pairs), std, turn_std)
     drawn = RelativePose(len(found.pairs), std, turn_std, outliers)
-    measured = RecordedPoses(drawn, found.pairs, Tape(found.pose[at]), Tape(found.there[at]))
+    poses, there = Series(found.pose[at]), Series(found.there[at])
+    measured = RecordedPoses(drawn, found.pairs, poses, there, dict(recording.dropped))
     return Scenario(
         name="replay-murp-v0",
         arena=arena_of(recording, grid, margin=0.5),
@@ -140,17 +131,5 @@ def replay_murp(
         process=ConstantVelocity(accel_std=0.3),
         believed_sensors=(odometry, matches, reference),
         reward=reward,
-        guides=1,
+        anchor_uavs=1,
     )
-
-
-def _ranges(recording: Recording, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Ranges [T, N, N, I, J] between antenna i of one agent and j of another, and which are
-    there."""
-    tags, robots = recording.tags.shape[1], len(recording.robots)
-    if not (recording.tags == recording.tags[0]).all():
-        raise DataError(f"{recording.name}: its agents carry different antennas")
-    tape = recorded_ranges(recording, grid, Ranging(tags=lever_arms(recording))).tape
-    shape = (robots, tags, tags)
-    ranges, there = (tape[leaf].values.unflatten(-1, shape) for leaf in ("ranges", "range_mask"))
-    return ranges.double(), there > 0

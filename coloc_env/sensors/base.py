@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Arena, Kinematics
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 MASK = (0.0, 1.0)
 
@@ -39,7 +39,7 @@ class Window:
 
     ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
     step 0). ``rows`` are the rows' noise keys, ``keys`` those of (row, step). Slot ``s`` of UAV
-    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach`` says whether its radio signal arrives,
+    ``i`` holds UAV ``neighbours[…, i, s]``; ``reach``: whether its radio signal arrives,
     message loss aside.
     """
 
@@ -72,7 +72,14 @@ class Sensor(ABC):
     """
 
     informs: ClassVar[bool] = True
-    """Whether its leaves tell of where UAVs are (a frame that estimates are stated in does not)."""
+    """Whether it is a measurement (the frame that estimates are stated in is none)."""
+
+    between_uavs: ClassVar[bool] = False
+    """Whether it ties UAVs together (as a range between two does, a range to an anchor not)."""
+
+    may_be_blind: ClassVar[bool] = True
+    """Whether it measures nothing at steps at which the truth is not known (what is recorded, and
+    what drives a motion model, is there at every step)."""
 
     @property
     def delay(self) -> int:
@@ -114,19 +121,24 @@ class Sensor(ABC):
 
     @abstractmethod
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf says so."""
+        """Leaves [R, K, N, F] float32; masked entries are 0 and their mask leaf is 0 there."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded(Sensor):
-    """A sensor whose samples come from a recording: step k delivers ``tape[leaf][k]``.
+class RecordedSensor(Sensor):
+    """A sensor whose samples come from a recording: step k delivers ``series[leaf][k]``.
 
-    ``sensor`` describes the leaves; each tape is float32 [T, N, F]; maps are [F].
+    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F]. ``dropped``: by
+    the recording's stream, how many measurements were left out, since no sensor can have given
+    them.
     """
 
+    may_be_blind = False
+
     sensor: Sensor
-    tape: dict[str, Tape]
+    series: dict[str, Series]
     maps: dict[str, Tensor] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)
@@ -144,7 +156,7 @@ class Recorded(Sensor):
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         alive = window.alive.unsqueeze(-1)
-        return {name: tape.at(window.steps) * alive for name, tape in self.tape.items()}
+        return {name: values.at(window.steps) * alive for name, values in self.series.items()}
 
 
 def require(condition: bool, owner: Any, name: str, allowed: str) -> None:

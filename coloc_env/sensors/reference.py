@@ -14,12 +14,13 @@ class Reference(Sensor):
     """Leaf ``reference`` [P]: the true pose of UAV 0 in the world frame, the same for every UAV:
     position (m), then quaternion wxyz or heading (rad).
 
-    Where a team measures nothing but poses relative to each other, no estimate can say where in
-    the world it is. This leaf says what the world frame is, so that a pose relative to UAV 0 can
+    Where a team measures nothing but poses relative to each other, no estimate can state where
+    in the world it is. This leaf defines the world frame, so that a pose relative to UAV 0 can
     be stated, and scored, in it. It is a convention, no measurement: a localizer that took UAV 0's
-    motion from it would know more than its sensors say.
+    motion from it would know more than its sensors measure.
     """
 
+    may_be_blind = False
     informs = False
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:

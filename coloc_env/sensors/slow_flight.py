@@ -1,4 +1,4 @@
-"""What a team knows of how it flies, used like a sensor: nobody flies fast for long."""
+"""What a team knows of its motion, used like a sensor: nobody flies fast for long."""
 
 from dataclasses import dataclass
 

@@ -14,7 +14,7 @@ from coloc_env.render.snapshot import take
 from coloc_env.world import World
 
 
-def flown(steps, **overrides):
+def simulated(steps, **overrides):
     """A renderer that recorded ``steps`` steps of plausible estimates, and its world."""
     scenario = make_scenario("indoor-v0", **overrides)
     world = World(scenario)
@@ -46,7 +46,7 @@ def flown(steps, **overrides):
 )
 @pytest.mark.parametrize("steps", [0, 25])
 def test_every_kind_of_scene_is_drawn(overrides, steps):
-    renderer, world = flown(steps, **overrides)
+    renderer, world = simulated(steps, **overrides)
     frame = renderer.render(world, "rgb_array")
     assert frame.dtype == np.uint8
     assert frame.ndim == 3
@@ -55,7 +55,7 @@ def test_every_kind_of_scene_is_drawn(overrides, steps):
 
 
 def test_guides_are_drawn_where_they_are_and_count_for_nothing():
-    world = World(make_scenario("swarm-v0", n_uavs=8, anchors=0.4))
+    world = World(make_scenario("swarm-v0", n_uavs=8, anchor_share=0.4))
     world.reset(0)
     snapshot = take(world, torch.zeros(1, 8, 9))
     assert np.array_equal(snapshot.position, world.truth.position[0].numpy())
@@ -68,17 +68,17 @@ def test_guides_are_drawn_where_they_are_and_count_for_nothing():
 
 
 def test_same_history_same_picture_and_another_one_differs():
-    first, world = flown(12)
-    second, other = flown(12)
+    first, world = simulated(12)
+    second, other = simulated(12)
     frame = first.render(world, "rgb_array")
     assert np.array_equal(frame, second.render(other, "rgb_array"))
-    third, later = flown(13)
+    third, later = simulated(13)
     assert not np.array_equal(frame, third.render(later, "rgb_array"))
 
 
 def test_drawing_leaves_pyplot_and_its_settings_alone():
     before = dict(matplotlib.rcParams)
-    renderer, world = flown(2)
+    renderer, world = simulated(2)
     renderer.render(world, "rgb_array")
     assert dict(matplotlib.rcParams) == before
 
@@ -93,7 +93,7 @@ def test_an_env_renders_before_its_first_step_and_pickles():
 
 
 def test_files_of_frames(tmp_path):
-    renderer, world = flown(3)
+    renderer, world = simulated(3)
     frame = renderer.render(world, "rgb_array")
     frame_to_png(frame, tmp_path / "scene.png")
     save_animation([frame, 255 - frame], tmp_path / "flight.gif", 10)

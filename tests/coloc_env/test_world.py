@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.envs.actions import Estimates, check
+from coloc_env.envs.actions import Estimates, checked_tensor
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled
@@ -188,9 +188,9 @@ def compare_episodes(
     """Every episode of every row against a world of its own."""
     batch = list(play(scenario, seeds, steps, window, resets))
     for row, seed in enumerate(seeds):
-        begun = {0: seed} | {k: fresh[row] for k, (rows, fresh) in resets.items() if rows[row]}
-        for begin, end in pairwise([*sorted(begun), steps]):
-            alone = play(scenario, [begun[begin]], end - begin)
+        starts = {0: seed} | {k: fresh[row] for k, (rows, fresh) in resets.items() if rows[row]}
+        for begin, end in pairwise([*sorted(starts), steps]):
+            alone = play(scenario, [starts[begin]], end - begin)
             for j, single in enumerate(alone):
                 # What was scored before an episode's first step belongs to the episode before.
                 late = ("reward", "error", "scored", "terminated", "truncated") if not j else ()
@@ -435,8 +435,8 @@ def test_wrong_arguments_are_named() -> None:
     world.reset(0)
     mode = Estimates(scenario.believed)
     with pytest.raises(ValueError, match=r"indoor-v0: actions of shape \(2, 6, 8\).*\(2, 6, 9\)"):
-        check(scenario, mode, torch.zeros(2, 6, 8), 2)
+        checked_tensor(scenario, mode, torch.zeros(2, 6, 8), 2)
     bad = torch.zeros(2, 6, 9)
     bad[1, 4, 2] = float("inf")
     with pytest.raises(ValueError, match="indoor-v0: the action of uav_4 in world 1 holds NaN"):
-        check(scenario, mode, bad, 2)
+        checked_tensor(scenario, mode, bad, 2)

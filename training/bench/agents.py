@@ -33,7 +33,7 @@ _RELATIVE = {"2-D": "stein2d-v0", "3-D": "stein3d-v0"}
 
 @dataclass(frozen=True)
 class Task:
-    """An agent in a scenario, and under what its time is told: the group's ``key``."""
+    """An agent in a scenario, and the ``key`` of its time within the ``group``."""
 
     group: str
     key: str

@@ -1,7 +1,7 @@
 """``coloc bench``: how fast worlds, both faces and localizers are, beside other environments.
 
 One CPU thread. Everything is timed in turn, round after round, so that a neighbour on the machine
-slows all alike; the figure is the best round, the median beside it tells how noisy it was.
+slows all alike; the figure is the best round, the median beside it shows how noisy it was.
 """
 
 import json
@@ -170,12 +170,12 @@ def _track(items: Sequence[T], what: str) -> Iterable[T]:
 
 
 def _memory() -> float | None:
-    """How many MB a fresh process grows at its peak for 1024 worlds; None where it cannot tell."""
+    """How many MB a fresh process grows at its peak for 1024 worlds; None where not known."""
     if not sys.platform.startswith("linux"):
         return None
     command = [sys.executable, "-c", _MEMORY]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    return int(told) * 1024 / 1e6
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return int(printed) * 1024 / 1e6
 
 
 def _versions() -> dict[str, str | None]:

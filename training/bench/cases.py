@@ -100,7 +100,7 @@ def _pettingzoo(n_uavs: int) -> Callable[[], Timed]:
 
 def _step(size: int) -> Callable[[], Timed]:
     def setup() -> Timed:
-        env = CoLocEnv(num_envs=size, horizon=ENDLESS)
+        env = CoLocEnv(num_envs=size, seed=0, horizon=ENDLESS)
         now = [env.reset()]
         action = torch.zeros(size, 6, 9)
 
@@ -118,7 +118,7 @@ def _rollout(size: int) -> Callable[[], Timed]:
     """Random actions, as ``rollout`` without a policy takes them."""
 
     def setup() -> Timed:
-        env = CoLocEnv(num_envs=size, horizon=ENDLESS)
+        env = CoLocEnv(num_envs=size, seed=0, horizon=ENDLESS)
 
         def run(steps: int) -> None:
             env.rollout(steps, break_when_any_done=False)
@@ -143,7 +143,7 @@ def _collect(size: int) -> Callable[[], Timed]:
         )
         steps = _STEPS[size]
         collector = Collector(
-            CoLocEnv(num_envs=size, horizon=ENDLESS),
+            CoLocEnv(num_envs=size, seed=0, horizon=ENDLESS),
             policy,
             frames_per_batch=size * steps,
             total_frames=-1,

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from agents.wrappers.correction import learners_mode
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.pettingzoo import parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.scenarios import make_scenario
 from training.bench.cases import Case, Timed
 from training.learning import mappo as _mappo  # noqa: F401  (registers its trainings)
@@ -47,7 +46,9 @@ def _pettingzoo() -> Timed:
 
 def _per_uav(base: str) -> Callable[[], Timed]:
     def setup() -> Timed:
-        env = PerUavEnv(CoLocEnv(_SCENE, WORLDS, action=learners_mode(_SCENE.believed, base)))
+        env = PerUavEnv(
+            CoLocEnv(_SCENE, WORLDS, seed=0, action=learners_mode(_SCENE.believed, base))
+        )
 
         def run(steps: int) -> None:
             env.rollout(steps, break_when_any_done=False)
@@ -59,7 +60,7 @@ def _per_uav(base: str) -> Callable[[], Timed]:
 
 def _vec_env(base: str) -> Callable[[], Timed]:
     def setup() -> Timed:
-        env = CoLocVecEnv(_SCENE, WORLDS, action=learners_mode(_SCENE.believed, base))
+        env = CoLocVecEnv(_SCENE, WORLDS, seed=0, action=learners_mode(_SCENE.believed, base))
         env.reset()
         actions = np.zeros((env.num_envs, 3), np.float32)
 
@@ -87,7 +88,7 @@ def _trained(name: str, base: str) -> Callable[[], Timed]:
 
         def run(steps: int) -> None:
             for _ in range(steps // HORIZON):
-                training.flights.epoch = 0
+                training.collector.epoch = 0
                 training.trainer.train()
 
         return Timed(run, HORIZON)

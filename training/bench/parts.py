@@ -1,8 +1,13 @@
-"""Where the time of a localizer's step goes: its parts' own time, by watching the calls."""
+"""Where the time of a localizer's step goes: its parts' own time, by watching the calls.
 
+Parts are named where they are looked up, so a renamed function must be renamed here too;
+``missing_parts`` names those that are gone, and a test fails for them.
+"""
+
+import pkgutil
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -91,6 +96,28 @@ def step_parts(localizer: Localizer, scenario: Scenario) -> dict[str, float]:
     return {part: 1e3 * seconds / _STEPS for part, seconds in ordered}
 
 
+def missing_parts(localizers: Iterable[Localizer]) -> list[str]:
+    """Names of parts that there are no more: functions, and methods that no localizer has."""
+    gone = []
+    for path in _FUNCTIONS:
+        try:
+            pkgutil.resolve_name(path)
+        except (ImportError, AttributeError):
+            gone.append(path)
+    every = list(localizers)
+    gone += [path for path in _METHODS if all(_owner(one, path) is None for one in every)]
+    return gone
+
+
+def _owner(localizer: Localizer, path: str) -> Any:
+    """The object whose method ``path`` names, from the localizer on; None if it has none."""
+    *owners, name = path.split(".")
+    owner: Any = localizer
+    for one in owners:
+        owner = getattr(owner, one, None)
+    return owner if hasattr(owner, name) else None
+
+
 @contextmanager
 def _watching(localizer: Localizer, watch: Stopwatch) -> Iterator[None]:
     """Every known part replaced by its watched self."""
@@ -100,11 +127,8 @@ def _watching(localizer: Localizer, watch: Stopwatch) -> Iterator[None]:
             original, _ = mock.get_original()
             stack.enter_context(patch(path, watch.watched(part, original)))
         for path, part in _METHODS.items():
-            *owners, name = path.split(".")
-            owner: Any = localizer
-            for one in owners:
-                owner = getattr(owner, one, None)
-            if hasattr(owner, name):
+            owner, name = _owner(localizer, path), path.split(".")[-1]
+            if owner is not None:
                 watched = watch.watched(part, getattr(owner, name))
                 stack.enter_context(patch.object(owner, name, watched))
         for model in getattr(localizer, "models", ()):

@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
+from training.cli.options import Data, Seed, require_seed
 from training.cli.terminal import progress
+from training.threads import use_threads
 
 
 def reproduce(
@@ -33,7 +35,7 @@ def reproduce(
             "cspf, 50 for stdcl, 40 for marl; fewer where a run is expensive."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the first world.")] = 0,
+    seed: Seed = 0,
     agents: Annotated[
         str | None,
         typer.Option(metavar="A,B,C", help="These agents only; the others are not run."),
@@ -55,10 +57,7 @@ def reproduce(
     ] = None,
     jobs: Annotated[int, typer.Option(help="Processes at once, of one thread each.")] = 1,
     fresh: Annotated[bool, typer.Option("--fresh", help="Throw the store away first.")] = False,
-    data: Annotated[
-        Path | None,
-        typer.Option("--data", metavar="DIR", help="Folder of recordings (sets COLOC_DATA)."),
-    ] = None,
+    data: Data = None,
 ) -> None:
     """Run a paper's experiments, and write its tables and figures with its numbers beside ours.
 
@@ -88,16 +87,13 @@ def reproduce(
         return
     if data is not None:
         os.environ["COLOC_DATA"] = str(data)
-    # What MKL computes would else depend on where in memory it lies; set before it is first used.
-    os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
-    import torch
-
+    require_seed(seed)
+    use_threads(1)
     from training.evaluation.evaluate import split_agents
     from training.reproduce.settings import Settings
     from training.reproduce.study import STUDIES
     from training.reproduce.study import reproduce as run
 
-    torch.set_num_threads(1)
     chosen = STUDIES.require(study)()
     settings = Settings(
         out,

@@ -19,22 +19,26 @@ _PIPED = 160  # columns of a table that no terminal shows
 
 def explain(name: str, registry: Registry, kind: str) -> None:
     """Print what a registered name is by its docstring, and its options (each a ``kind``, a
-    singular noun) in groups, with units, what is allowed, and defaults."""
-    from training.evaluation.results import typed
+    singular noun) in groups: what each may be, with its unit, and its default."""
+    from training.evaluation.tables import typed
 
     known = registry.options_of(name)
     text = "\n\n".join(map(escape, paragraphs(inspect.getdoc(registry[name]) or "")))
-    Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
+    console = Console()
+    console.print(f"[bold]{escape(name)}[/bold]\n{text}", highlight=False)
     if not known:
-        typer.echo(f"no {kind}s")
-    groups = dict.fromkeys(option.group for option in known.values())
+        typer.echo(f"\nno {kind}s")
+    groups = {option.group: option.about for option in known.values()}
+    width = max(map(len, known), default=0)
     for group in sorted(groups, key=bool):  # those of the function itself first
+        about = f"\n{escape(groups[group])}" if groups[group] else ""
+        console.print(f"\n[bold]{group or f'{kind}s'}[/bold]{about}", highlight=False)
         lines = [
-            [option.name, option.words, typed(option.default)]
+            [option.name.ljust(width), option.words, typed(option.default)]
             for option in known.values()
             if option.group == group
         ]
-        show([group or kind, "allowed", "default"], lines)
+        show(["", "allowed", "default"], lines)
 
 
 def show(header: list[str], lines: list[list[str]]) -> None:
@@ -55,7 +59,7 @@ def show(header: list[str], lines: list[list[str]]) -> None:
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Bars on stderr, where that is a terminal. The block is given a function to be told a task's
+    """Bars on stderr, where that is a terminal. The block is given a function to call with a task's
     name, how much of it is done, and of how much; each task has a bar of its own."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
@@ -63,9 +67,9 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
         tasks: dict[str, Any] = {}
 
-        def tell(what: str, done: int, total: int) -> None:
+        def advance(what: str, done: int, total: int) -> None:
             if what not in tasks:
                 tasks[what] = bars.add_task(escape(what), total=total)
             bars.update(tasks[what], completed=done, total=total)
 
-        yield tell
+        yield advance

@@ -1,6 +1,7 @@
 """Evaluation: every agent meets the same worlds, batched over runs, and nothing is ever dropped."""
 
 import statistics
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from agents.localizer import Localizer
 from agents.registry import make
 from coloc_env.bounds import Bound, posterior_bound
 from coloc_env.scenario import Scenario
+from coloc_env.seeding import checked_seed
 from coloc_env.world import World
 from training.evaluation.record import RunRecord, record
 from training.evaluation.results import Evaluation
@@ -44,25 +46,41 @@ def evaluate(
     bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
     are fast); no result depends on it, a localizer's own rounding aside.
 
-    A run in which an agent says NaN or infinity, or raises a numerical error, goes on with the last
-    finite estimates (the prior before the first) and counts as diverged.
+    A run in which an agent's estimate is NaN or infinite, or that raises a numerical error, goes on
+    with the last finite estimates (the prior before the first) and counts as diverged. An agent
+    that raises any other error has no metrics but that error, and the others go on; if all do, the
+    first one's error is raised.
     """
     _check(agents, runs, seed, chunk)
     team = {name: make(name, scenario) for name in agents}
     known = _bound(scenario, runs, seed, progress) if bound else None
     records: dict[str, RunRecord] = {}
+    errors: dict[str, Exception] = {}
     for name, localizer in team.items():
-        found = _runs(name, localizer, scenario, runs, seed, chunk, progress)
-        records[name] = replace(found, ms_per_step=ms_per_step(localizer, scenario, seed))
-    return Evaluation(scenario, next(iter(records.values())).worlds, known, records)
+        try:
+            found = _runs(name, localizer, scenario, runs, seed, chunk, progress)
+            records[name] = replace(found, ms_per_step=ms_per_step(localizer, scenario, seed))
+        except Exception as error:
+            errors[name] = error
+    if not records:
+        raise next(iter(errors.values()))
+    return Evaluation(
+        scenario,
+        next(iter(records.values())).worlds,
+        known,
+        records,
+        {name: f"{type(e).__name__}: {' '.join(str(e).split())}" for name, e in errors.items()},
+    )
 
 
 def split_agents(text: str) -> list[str]:
     """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
-    option before (``apf:bounds=100,800``)."""
+    option before (``apf:bounds=100,800``), and so does a piece of a path (``weights=a,b/c``)."""
     names: list[str] = []
     for piece in text.split(","):
-        if names and piece[:1] in set("0123456789+-."):
+        head = piece.partition("=")[0]
+        path = "/" in head or ".safetensors" in head
+        if names and (path or piece[:1] in set("0123456789+-.")):
             names[-1] += f",{piece}"
         elif piece.strip():
             names.append(piece.strip())
@@ -77,8 +95,7 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
         raise ValueError(f"agent {twice!r} is named twice")
     if runs < 1:
         raise ValueError(f"runs={runs} is not allowed: at least 1")
-    if not 0 <= seed < 2**62:
-        raise ValueError(f"seed={seed} is not allowed: a whole number from 0 to 2^62")
+    checked_seed(seed, "evaluate")
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk={chunk} is not allowed: at least 1")
 
@@ -88,7 +105,10 @@ def _bound(scenario: Scenario, runs: int, seed: int, progress: Progress) -> Boun
     progress("bound", 0, 1)
     try:
         known = posterior_bound(scenario, runs=runs, seed=seed)
-    except (ValueError, NotImplementedError, torch.linalg.LinAlgError):
+    except NotImplementedError as error:  # a sensor that it cannot count
+        warnings.warn(f"{scenario.name}: no posterior bound: {error}", stacklevel=3)
+        known = None
+    except (ValueError, torch.linalg.LinAlgError):
         known = None
     progress("bound", 1, 1)
     return known

@@ -15,8 +15,9 @@ from matplotlib.transforms import Bbox
 
 from coloc_env.render.style import GRID, INK, MUTED, uav_colours
 from training.evaluation import metrics
+from training.evaluation.files import FIGURES
 from training.evaluation.metrics import Flags, Floats
-from training.evaluation.results import FIGURES, Evaluation
+from training.evaluation.results import Evaluation
 
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -69,11 +70,11 @@ def error_over_time(results: Evaluation) -> Figure:
     note = "line: root mean square over runs and UAVs; shade: middle half of the errors"
     figure, axes = _figure(results, "Position error over time", note)
     time = _time(results)
-    for name, look in _looks(results).items():
+    for name, style in _line_styles(results).items():
         error = results.agents[name].error
-        axes.plot(time, metrics.rmse_per_step(error, results.worlds.scored), **look)
+        axes.plot(time, metrics.rmse_per_step(error, results.worlds.scored), **style)
         half = _quantiles_per_step(error, results.worlds.scored, (0.25, 0.75))
-        axes.fill_between(time, *half, color=look["color"], alpha=0.12, linewidth=0)
+        axes.fill_between(time, *half, color=style["color"], alpha=0.12, linewidth=0)
     if results.bound is not None:
         bound = results.bound.mse.numpy() ** 0.5
         axes.plot(time, metrics.rmse_per_step(bound, results.bound.scored.numpy()), **BOUND)
@@ -88,10 +89,10 @@ def error_distribution(results: Evaluation) -> Figure:
     """Share of all errors below a value."""
     figure, axes = _figure(results, "Distribution of position errors", "all steps, UAVs and runs")
     share = np.concatenate(([1e-3], np.linspace(0.005, 0.995, 397), [0.999, 1]))
-    for name, look in _looks(results).items():
+    for name, style in _line_styles(results).items():
         errors = results.agents[name].error[results.worlds.scored]
         if errors.size:
-            axes.plot(np.quantile(errors, share), 100 * share, **look)
+            axes.plot(np.quantile(errors, share), 100 * share, **style)
     _mark_bound(axes, results)
     axes.set(xlabel="position error (m)", ylabel="share of errors below (%)", ylim=(0, 100))
     log_axis(axes.xaxis, axes.set_xscale)
@@ -107,9 +108,9 @@ def error_boxes(results: Evaluation) -> Figure:
     note += "" if results.bound is None else "; dashed: bound"
     figure, axes = _figure(results, "RMSE of each UAV in each run", note, 1.7 + 0.5 * count)
     jitter = np.random.default_rng(0)
-    for row, (name, look) in enumerate(_looks(results).items()):
+    for row, (name, style) in enumerate(_line_styles(results).items()):
         tracks = metrics.rmse_per_track(results.agents[name].error, results.worlds.scored)
-        tracks, line = tracks[np.isfinite(tracks)], {"color": look["color"]}
+        tracks, line = tracks[np.isfinite(tracks)], {"color": style["color"]}
         if not tracks.size:
             continue
         axes.boxplot(
@@ -120,7 +121,7 @@ def error_boxes(results: Evaluation) -> Figure:
             whis=(5, 95),
             showfliers=False,
             patch_artist=True,
-            boxprops={"facecolor": (*look["color"], 0.2), "edgecolor": look["color"]},
+            boxprops={"facecolor": (*style["color"], 0.2), "edgecolor": style["color"]},
             medianprops=line | {"linewidth": 2},
             whiskerprops=line,
             capprops=line,
@@ -146,9 +147,9 @@ def consistency(results: Evaluation) -> Figure:
     note = f"mean over runs and UAVs; {dim} is consistent (shade: 95 %), more is overconfident"
     figure, axes = _figure(results, "Consistency: NEES over time", note)
     time = _time(results)
-    for name, look in _looks(results).items():
-        look["linewidth"] *= 0.6
-        axes.plot(time, _mean_per_step(results.agents[name].nees, results.worlds.scored), **look)
+    for name, style in _line_styles(results).items():
+        style["linewidth"] *= 0.6
+        axes.plot(time, _mean_per_step(results.agents[name].nees, results.worlds.scored), **style)
     counts = results.worlds.scored.sum((0, 2)).tolist()
     bands = {n: metrics.nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts)}
     low, high = np.array([bands[n] for n in counts]).T
@@ -169,23 +170,23 @@ def trajectories(results: Evaluation) -> Figure:
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2 if deep else 1, squeeze=False)[0]
     shown = results.worlds.scored[0, last][..., None]
-    truth = np.where(shown, results.worlds.truth[0, last], np.nan)
+    truth = np.where(shown, results.worlds.truth[0, last] + results.origin, np.nan)
     tracks = [(truth, _TRUTH)]
-    for name, look in _looks(results).items():
-        tracks.append((truth + results.agents[name].offset[0, last], look | {"linewidth": 1.0}))
+    for name, style in _line_styles(results).items():
+        tracks.append((truth + results.agents[name].offset[0, last], style | {"linewidth": 1.0}))
     title = f"Seed {results.seed}"
     time = np.broadcast_to(_time(results)[last, None], truth.shape[:2])
     plan = slice(0, _IN_PLAN)
-    for position, look in tracks:
-        panels[0].plot(position[:, plan, 0], position[:, plan, 1], **look)
+    for position, style in tracks:
+        panels[0].plot(position[:, plan, 0], position[:, plan, 1], **style)
     panels[0].set(xlabel="x (m)", ylabel="y (m)", title=f"{title}: plan{_which(results, _IN_PLAN)}")
     panels[0].set_aspect("equal", adjustable="box")
     _limit(panels[0].set_xlim, truth[:, plan, 0])
     _limit(panels[0].set_ylim, truth[:, plan, 1])
     if deep:
         few = slice(0, _IN_HEIGHT)
-        for position, look in tracks:
-            panels[1].plot(time[:, few], position[:, few, 2], **look)
+        for position, style in tracks:
+            panels[1].plot(time[:, few], position[:, few, 2], **style)
         panels[1].set(xlabel="time (s)", ylabel="z (m)", xlim=_span(time[:, 0], results.dt))
         panels[1].set_title(f"{title}: height{_which(results, _IN_HEIGHT)}")
         _limit(panels[1].set_ylim, truth[:, few, 2])
@@ -206,7 +207,7 @@ def _figure(results: Evaluation, title: str, note: str, height: float = 4.5) -> 
     return figure, axes
 
 
-def _looks(results: Evaluation) -> dict[str, dict[str, Any]]:
+def _line_styles(results: Evaluation) -> dict[str, dict[str, Any]]:
     """One colour per agent, the same in all figures; later lines are thinner, so that lines that
     coincide can all be seen."""
     names = list(results.agents)
@@ -222,8 +223,8 @@ def _legend(
     figure: Figure, results: Evaluation, handles: Sequence[Line2D] = (), bound: bool = True
 ) -> None:
     """Agents, and the bound, below the axes."""
-    looks = _looks(results).items()
-    lines = [*handles, *(Line2D([], [], label=x, color=y["color"], lw=2) for x, y in looks)]
+    styles = _line_styles(results).items()
+    lines = [*handles, *(Line2D([], [], label=x, color=y["color"], lw=2) for x, y in styles)]
     if bound and results.bound is not None:
         lines.append(Line2D([], [], label="bound", **BOUND))
     letters = sum(len(str(line.get_label())) + 6 for line in lines)

@@ -196,7 +196,7 @@ def _recorded(
 
 
 def _own_figures(localizer: Localizer, step: Step) -> dict[str, Tensor]:
-    """A method's own figures at a step, and how far it is off about the team, if it says."""
+    """A method's own figures at a step, and the errors of what it estimates of the team, if so."""
     poses = localizer.team(step.belief)
     figures = localizer.diagnostics(step.belief)
     return figures if poses is None else figures | team_figures(poses, step.world.truth)

@@ -14,13 +14,15 @@ from training.evaluation.results import Evaluation
 
 
 def write_tum(results: Evaluation, folder: Path) -> None:
-    """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only."""
+    """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only; of a
+    recording in the frame that it was recorded in."""
+    truth = results.worlds.truth[0] + results.origin
     time = np.arange(results.scenario.horizon) * results.dt
     attitude = quaternions(results.worlds.attitude)
     identity = np.broadcast_to((0.0, 0.0, 0.0, 1.0), attitude.shape)
-    tracks = {"groundtruth": (results.worlds.truth[0], attitude)}
+    tracks = {"groundtruth": (truth, attitude)}
     for name, label in zip(results.agents, folder_names(list(results.agents)), strict=True):
-        tracks[label] = (results.worlds.truth[0] + results.agents[name].offset[0], identity)
+        tracks[label] = (truth + results.agents[name].offset[0], identity)
     for label, (position, turned) in tracks.items():
         (folder / label).mkdir(parents=True)
         for i, uav in enumerate(results.scenario.agents):
@@ -30,10 +32,11 @@ def write_tum(results: Evaluation, folder: Path) -> None:
 
 
 def tum_text(time: Floats, position: Floats, quaternion: Floats) -> str:
-    """Lines for times [K] s, positions [K, d] m and quaternions [K, 4] xyzw."""
+    """Lines for times [K] s, positions [K, d] m and quaternions [K, 4] xyzw: to the hundredth of a
+    millimetre wherever on Earth."""
     flat = np.zeros((len(time), 3 - position.shape[1]))
     table = np.concatenate((time[:, None], position, flat, quaternion), 1)
-    return "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in table.tolist())
+    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in table.tolist())
 
 
 def quaternions(attitude: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """One learner among localizers: a single UAV as a Gymnasium environment, for stable-baselines3.
 
-The other UAVs are flown by a localizer (``others``). The learner starts from nothing: it moves its
+The other UAVs are localized by a filter (``others``). The learner starts from nothing: it moves its
 last estimate (``base="none"``; with a localizer's name it corrects that one's estimates instead).
 
     pip install -e .
@@ -19,7 +19,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from agents.policies.team import SingleUavEnv
+from agents.wrappers.single_uav import single_uav
+from coloc_env.envs.gymnasium import SingleUavEnv
 
 Policy = Callable[[np.ndarray], np.ndarray]
 
@@ -44,15 +45,15 @@ def main(
     options: dict[str, Any] = {"others": "ekf", "base": "none", "motion": "random"}
     options["horizon"] = horizon
 
-    def flying(i: int) -> SingleUavEnv:
-        env = SingleUavEnv(**options)
+    def make_env(i: int) -> SingleUavEnv:
+        env = single_uav(**options)
         env.reset(seed=1_000_000 * (seed + 1) + 10_000 * i)  # the first of this one's own worlds
         return env
 
     # Not PPO(seed=...): that would restart the copies at worlds seed, seed + 1, ...; as each goes
-    # on to the next world by itself, they would fly the same worlds, and those of the score.
+    # on to the next world by itself, they would meet the same worlds, and those of the score.
     set_random_seed(seed)
-    train = VecNormalize(DummyVecEnv([partial(flying, i) for i in range(envs)]), gamma=0.0)
+    train = VecNormalize(DummyVecEnv([partial(make_env, i) for i in range(envs)]), gamma=0.0)
     model = PPO(
         "MlpPolicy",
         train,
@@ -67,11 +68,11 @@ def main(
     def policy(observation: np.ndarray) -> np.ndarray:
         return model.predict(train.normalize_obs(observation[None]), deterministic=True)[0][0]
 
-    score = SingleUavEnv(**options)
+    score = single_uav(**options)
     before = mean_error(score, policy, episodes, seed)
-    began = time.perf_counter()
+    start = time.perf_counter()
     model.learn(steps)
-    speed = model.num_timesteps / (time.perf_counter() - began)
+    speed = model.num_timesteps / (time.perf_counter() - start)
     after = mean_error(score, policy, episodes, seed)
     print(f"mean error {before:.2f} m before, {after:.2f} m after {model.num_timesteps} steps")
     print(f"{speed:,.0f} steps/s of the one UAV")

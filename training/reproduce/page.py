@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from training.evaluation.results import table
+from training.evaluation.tables import table
 
 Content = Mapping[str, Any]
 _ALIGN = {"left": "---", "right": "---:"}

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from coloc_env.seeding import checked_seed
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -12,8 +14,7 @@ class Settings:
     only (None: all); ``steps``: cut runs to so many (None: whole runs); ``jobs``: processes at
     once; ``fresh``: throw the store away first; ``report_only``: compute nothing.
 
-    Raises ValueError, in one line, for a value that is not allowed, and for a folder that cannot
-    be written.
+    Links in ``out`` are followed. Raises ValueError, in one line, for a value that is not allowed.
     """
 
     out: Path
@@ -32,11 +33,10 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"--{name} {value} is not allowed: at least 1")
-        if not 0 <= self.seed < 2**62:
-            raise ValueError(f"--seed {self.seed} is not allowed: a whole number from 0 to 2^62")
+        checked_seed(self.seed, "reproduce")
         if self.fresh and self.report_only:
             raise ValueError("--fresh and --report-only: nothing would be left to report")
-        _require_folder(self.out)
+        object.__setattr__(self, "out", _resolved(self.out))
 
     @property
     def store(self) -> Path:
@@ -48,10 +48,8 @@ class Settings:
         return max(1, self.runs // divisor)
 
 
-def _require_folder(out: Path) -> None:
-    """Raise ValueError where there can be no such folder, before anything is computed."""
-    for path in (out, *out.absolute().parents):
-        if path.is_symlink() and not path.exists():
-            raise ValueError(f"{path} is a link to something that does not exist")
-        if path.exists() and not path.is_dir():
-            raise ValueError(f"{path} is not a folder")
+def _resolved(out: Path) -> Path:
+    try:
+        return out.resolve()
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise ValueError(f"{out} cannot be written: {error}") from None

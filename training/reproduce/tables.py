@@ -8,7 +8,7 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.results import Runs
 
 DASH = "–"

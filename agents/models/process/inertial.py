@@ -16,6 +16,9 @@ from coloc_env.sensors import GRAVITY, Imu
 class InertialProcess(Process):
     """Strapdown integration: x = [p, v, q] or [p, v, q, b_a, b_g], u = [f, ω], error size 9 or 15.
 
+    Where samples of a recorded IMU are missing u = [f, ω, s_f, s_ω], with the standard deviations
+    of what they leave unknown, which add to the noise: σ² + s².
+
     v' = v + (R (f − b_a) + g) dt,  p' = p + v dt + ½ (…) dt²,  q' = q ⊗ exp((ω − b_g) dt)
     (PF-NN paper, section 2.1, with the noise entering through the measured f and ω).
     """
@@ -41,22 +44,29 @@ class InertialProcess(Process):
             mean = torch.cat((mean, mean.new_zeros(*mean.shape[:-1], 6)), -1)
         return mean, torch.diag_embed(std**2)
 
-    def inputs(self, observation: Observation) -> Float[Tensor, "B N 6"]:
-        return observation["imu"].double()
+    def inputs(self, observation: Observation) -> Float[Tensor, "B N U"]:
+        imu = observation["imu"].double()
+        if "imu_unknown" not in observation:
+            return imu
+        unknown = observation["imu_unknown"].double().expand(*imu.shape[:-1], -1)
+        return torch.cat((imu, unknown), -1)
 
     def propagate(
         self,
         x: Float[Tensor, "*s S"],
-        u: Float[Tensor, "*s 6"],
+        u: Float[Tensor, "*s U"],
         dt: Float[Tensor, "*s"],
         noise: Float[Tensor, "*s W"] | None = None,
     ) -> Float[Tensor, "*s S"]:
         p, v, q, biases = x[..., :3], x[..., 3:6], x[..., 6:10], x[..., 10:]
         dt = dt.unsqueeze(-1)
+        u, unknown = u[..., :6], u[..., 6:]
         if self.biased:
             u = u - biases
         if noise is not None:
             std = u.new_tensor([self.imu.accel_std] * 3 + [self.imu.gyro_std] * 3)
+            if unknown.shape[-1]:
+                std = torch.hypot(std, unknown.repeat_interleave(3, -1))
             u = u + std * noise[..., :6]
             if self.walks:
                 walk = u.new_tensor([self.settings.accel_walk] * 3 + [self.settings.gyro_walk] * 3)
@@ -66,10 +76,10 @@ class InertialProcess(Process):
         return concat((p + (v + 0.5 * a * dt) * dt, v + a * dt, q, biases))
 
     def retreat(
-        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 6"], dt: Float[Tensor, "*s"]
+        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s U"], dt: Float[Tensor, "*s"]
     ) -> Float[Tensor, "*s S"]:
         p, v, q, biases = x[..., :3], x[..., 3:6], x[..., 6:10], x[..., 10:]
-        dt = dt.unsqueeze(-1)
+        dt, u = dt.unsqueeze(-1), u[..., :6]
         if self.biased:
             u = u - biases
         q = rotate_by(q, -u[..., 3:] * dt)
@@ -78,8 +88,9 @@ class InertialProcess(Process):
         return concat((p - (v + 0.5 * a * dt) * dt, v, q, biases))
 
     def linearize(
-        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s 6"], dt: Float[Tensor, "*s"]
+        self, x: Float[Tensor, "*s S"], u: Float[Tensor, "*s U"], dt: Float[Tensor, "*s"]
     ) -> tuple[Float[Tensor, "*s E E"], Float[Tensor, "*s E E"]]:
+        u, unknown = u[..., :6], u[..., 6:]
         if self.biased:
             u = u - x[..., 10:]
         rotation = rotations.matrix(x[..., 6:10])
@@ -93,19 +104,33 @@ class InertialProcess(Process):
         if self.biased:
             f[..., :3, 9:12] = -0.5 * rotation * h**2
             f[..., 3:6, 9:12] = -rotation * h
-        return f, self.added.to(x) * moving
+        q = self.added.to(x)
+        if unknown.shape[-1]:
+            q = q + self.strapdown_noise(*unknown.unbind(-1))
+        return f, q * moving
+
+    def strapdown_noise(
+        self, accel_std: Float[Tensor, "*s"], gyro_std: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s E E"]:
+        """Q over one step from white noise of f (m/s²) and ω (rad/s)."""
+        h, eye = self.dt, torch.eye(3, dtype=accel_std.dtype, device=accel_std.device)
+        accel = (accel_std * h).square()[..., None, None] * eye
+        q = accel.new_zeros(*accel.shape[:-2], self.error_size, self.error_size)
+        q[..., :3, :3] = 0.25 * h**2 * accel
+        q[..., :3, 3:6] = q[..., 3:6, :3] = 0.5 * h * accel
+        q[..., 3:6, 3:6] = accel
+        q[..., 6:9, 6:9] = (gyro_std * h).square()[..., None, None] * eye
+        return q
 
     def _constants(self) -> tuple[Float[Tensor, "E E"], Float[Tensor, "E E"]]:
         """The parts of F and Q over one step that no state changes."""
         h, e = self.dt, self.error_size
-        f, q = torch.eye(e, dtype=torch.float64), torch.zeros(e, e, dtype=torch.float64)
+        f = torch.eye(e, dtype=torch.float64)
         eye = torch.eye(3, dtype=torch.float64)
         f[:3, 3:6] = h * eye
-        accel, gyro = (self.imu.accel_std * h) ** 2, (self.imu.gyro_std * h) ** 2
-        q[:3, :3] = 0.25 * accel * h**2 * eye
-        q[:3, 3:6] = q[3:6, :3] = 0.5 * accel * h * eye
-        q[3:6, 3:6] = accel * eye
-        q[6:9, 6:9] = gyro * eye
+        q = self.strapdown_noise(
+            *torch.tensor([self.imu.accel_std, self.imu.gyro_std], dtype=torch.float64)
+        )
         if self.biased:
             f[6:9, 12:15] = -h * eye
             q[9:12, 9:12] = self.settings.accel_walk**2 * h * eye

@@ -17,7 +17,7 @@ class Clock:
 
     ``offset``: standard deviation in m of a, what calibration has left of each UAV's antenna delay,
     a constant drawn once. ``skew``: amplitude in m of s, from the frequency error e of its crystal:
-    i begins the exchange, j replies after T, and the range is off by ½ c T (e_i − e_j). It follows
+    i starts the exchange, j replies after T, and the range is off by ½ c T (e_i − e_j). It follows
     the crystal's temperature: a sine whose period is drawn once, between a half and twice
     ``period`` s, so that |s| ≤ ``skew``.
 
@@ -48,11 +48,11 @@ class Clock:
         self, window: Window, steps: Int64[Tensor, "R K"], placed: dict[str, Tensor]
     ) -> Float32[Tensor, "R K N S"]:
         """What is added to the range to each neighbour slot (m), made at ``steps``."""
-        time = (steps * window.layout.arena.dt).to(torch.float32).unsqueeze(-1)
+        time = steps.to(torch.float32).unsqueeze(-1) * window.layout.arena.dt
         skew = (placed["rate"].unsqueeze(1) * time).add_(placed["phase"].unsqueeze(1)).sin_()
         skew = self.skew * skew
         offset = placed["offset"].unsqueeze(1).expand_as(skew)
         own = torch.arange(skew.shape[-1], device=steps.device).unsqueeze(-1)
-        first = torch.where(own < window.neighbours, 1.0, -1.0)
+        first = 2.0 * (own < window.neighbours).to(torch.float32) - 1.0
         theirs, ahead = (in_slots(x, window.neighbours) for x in (offset, skew))
         return (offset.unsqueeze(-1) + theirs) + first * (skew.unsqueeze(-1) - ahead)

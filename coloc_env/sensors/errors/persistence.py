@@ -1,4 +1,4 @@
-"""Random numbers that last: drawn anew now and then, and kept in between."""
+"""Random numbers that last: redrawn now and then, and kept in between."""
 
 import math
 
@@ -21,7 +21,7 @@ def held_uniform(
 ) -> Float32[Tensor, "R K *l"]:
     """Numbers in (0, 1) of numbered links, in ``count`` steps from each row's ``first`` on.
 
-    In each step a link's number is drawn anew with probability 1 − exp(−1/``time``), else kept: a
+    In each step a link's number is redrawn with probability 1 − exp(−1/``time``), else kept: a
     Markov chain whose correlation falls by e in ``time`` steps. It is a pure function of row, step
     and link all the same: the number is that of the last renewal, looked for in the last
     10 ``time`` steps, else the link's very first. (That of an earlier renewal would be forgotten

@@ -88,7 +88,7 @@ def test_the_recurrent_step_is_torchs_lstm() -> None:
 
 @pytest.mark.parametrize("recurrent", [False, True])
 def test_the_best_action_is_that_of_torchrls_policy(recurrent: bool) -> None:
-    """Through LSTMModule and TanhNormal, with an episode that starts anew half-way."""
+    """Through LSTMModule and TanhNormal, with an episode that restarts half-way."""
     made = actor(recurrent=recurrent)
     policy: ProbabilisticActor = policy_of(made)
     memory = torch.zeros(1, 5, made.memory_size)

@@ -23,7 +23,7 @@ N = 3
 
 class Count(TensorClass["nocast"]):
     step: Tensor
-    begun: Tensor
+    started: Tensor
 
 
 class Belief(TensorClass["nocast"]):
@@ -40,7 +40,7 @@ class Gossip(Localizer[Belief]):
         shape = observation.batch_size
         count = Count(
             step=torch.zeros(shape, dtype=torch.int64),
-            begun=torch.zeros(shape, dtype=torch.bool),
+            started=torch.zeros(shape, dtype=torch.bool),
             batch_size=shape,
         )
         return Belief(position=observation["prior"][..., :3].clone(), count=count, batch_size=shape)
@@ -53,7 +53,7 @@ class Gossip(Localizer[Belief]):
         position = pulled + 0.001 * observation["imu"][..., :3]
         count = Count(
             step=belief.count.step + 1,
-            begun=torch.ones_like(belief.count.begun),
+            started=torch.ones_like(belief.count.started),
             batch_size=belief.batch_size,
         )
         estimate = Estimate(

@@ -16,8 +16,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from agents import make
 from agents.policies.adapters import ParallelPolicy
-from agents.policies.team import SingleUavEnv, Team
+from agents.policies.team import Team
 from agents.wrappers.correction import with_base
+from agents.wrappers.single_uav import single_uav
 from coloc_env.envs.pettingzoo import CoLocParallelEnv, parallel_env
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -139,14 +140,14 @@ def refused(words: str) -> Any:
     return pytest.raises(ValueError, match=re.escape(words))
 
 
-@pytest.mark.parametrize("make_one", [Team, SingleUavEnv])
+@pytest.mark.parametrize("make_one", [Team, single_uav])
 def test_unknown_uavs_and_methods_are_named(make_one: type) -> None:
     scenario = indoor()
 
     def one(uav: str, method: str) -> Any:
         if make_one is Team:
             return Team(scenario, {uav: method})
-        return SingleUavEnv(scenario, uav=uav, others=method)
+        return single_uav(scenario, uav=uav, others=method)
 
     with refused("there is no 'uav_3' in the team: uav_0, uav_1, uav_2"):
         one("uav_3", "ekf")
@@ -164,9 +165,9 @@ def test_a_method_for_whole_teams_does_not_fit_a_mixture(method: str) -> None:
     with refused(words):
         Team(scenario, {"uav_0": method, "uav_1": "ekf", "uav_2": "ekf"})
     with refused(words):
-        SingleUavEnv(scenario, others=method)
+        single_uav(scenario, others=method)
     with refused(words):
-        SingleUavEnv(scenario, base=method)
+        single_uav(scenario, base=method)
     team = Team(scenario, dict.fromkeys(scenario.agents, method))
     policy = ParallelPolicy(make(method, scenario))
     seen, actions, _ = episode(scenario, team)
@@ -179,7 +180,7 @@ def test_lever_arms_of_a_team_do_not_fit_one_uav() -> None:
     with refused(words):
         Team(tagged(), {"uav_0": "ekf"})
     with refused(words):
-        SingleUavEnv(tagged())
+        single_uav(tagged())
     Team(tagged(), dict.fromkeys(tagged().agents, "ekf"))
 
 
@@ -192,7 +193,7 @@ def test_one_learner_sees_and_does_as_in_a_team_of_learners(base: str, uav: str)
     """The same numbers as its own of a whole team in that mode, where UAVs do not hear each other
     (with corrections of others than nought, what the others say would differ)."""
     scenario = indoor(uwb=False)
-    one = SingleUavEnv(scenario, uav, others="dead_reckoning", base=base)
+    one = single_uav(scenario, uav, others="dead_reckoning", base=base)
     team = parallel_env(scenario)
     team = team.with_action("displacement") if base == "none" else with_base(team, base)
     rng = np.random.default_rng(0)
@@ -216,7 +217,7 @@ def test_the_others_are_localized_by_their_method() -> None:
     """An idle learner with a base is one more of that method: all rewards are the team's."""
     scenario = indoor(nlos=0.3)
     _, _, rewards = episode(scenario, ParallelPolicy(make("ekf", scenario)))
-    one = SingleUavEnv(scenario, "uav_1", others="ekf", base="ekf")
+    one = single_uav(scenario, "uav_1", others="ekf", base="ekf")
     one.reset(seed=2)
     for expected in rewards:
         found = one.step(np.zeros(3, np.float32))[1]
@@ -230,19 +231,19 @@ def test_gymnasiums_and_sb3s_own_checks(base: str) -> None:
         warnings.simplefilter("error")
         for words in (".*render mode.*", ".*is -infinity.*", ".*is infinity.*", ".*`check_env` is"):
             warnings.filterwarnings("ignore", message=words)  # what they mean as hints
-        check_env(SingleUavEnv(indoor(), base=base, render_mode="rgb_array"))
-        sb3_check_env(SingleUavEnv(indoor(), base=base), warn=True)
+        check_env(single_uav(indoor(), base=base, render_mode="rgb_array"))
+        sb3_check_env(single_uav(indoor(), base=base), warn=True)
 
 
 def test_sb3_learns_with_it() -> None:
-    env = SingleUavEnv(indoor(), base="none")
+    env = single_uav(indoor(), base="none")
     model = PPO("MlpPolicy", env, n_steps=18, batch_size=18, n_epochs=1, device="cpu")
     model.learn(36)
     assert model.num_timesteps == 36
 
 
 def test_a_seed_is_a_world_and_the_next_follows() -> None:
-    one, other = SingleUavEnv(indoor()), SingleUavEnv(indoor())
+    one, other = single_uav(indoor()), single_uav(indoor())
     first, _ = one.reset(seed=5)
     second, _ = one.reset()
     np.testing.assert_array_equal(other.reset(seed=5)[0], first)
@@ -251,17 +252,17 @@ def test_a_seed_is_a_world_and_the_next_follows() -> None:
 
 
 def test_an_episode_is_its_seed_and_its_actions() -> None:
-    one = SingleUavEnv(indoor(), others="pf500:particles=40")
+    one = single_uav(indoor(), others="pf500:particles=40")
 
-    def fly() -> list[str]:
-        told = [repr(one.reset(seed=3))]
-        return told + [repr(one.step(np.full(3, 0.3, np.float32))) for _ in range(H)]
+    def run() -> list[str]:
+        taken = [repr(one.reset(seed=3))]
+        return taken + [repr(one.step(np.full(3, 0.3, np.float32))) for _ in range(H)]
 
-    assert fly() == fly()
+    assert run() == run()
 
 
 def test_spaces_and_leaves() -> None:
-    one = SingleUavEnv(indoor(), base="none", leaves=["last_action", "imu"])
+    one = single_uav(indoor(), base="none", leaves=["last_action", "imu"])
     assert one.leaves == ("last_action", "imu")
     assert one.observation_space.shape == (9,)
     assert one.action_space.shape == (3,)
@@ -270,11 +271,11 @@ def test_spaces_and_leaves() -> None:
     seen, *_ = one.step(np.array([0.5, -2.0, 0.0], np.float32))
     assert seen[:3].tolist() == [0.5, -1.0, 0.0]
     with refused("there is no leaf 'gps'; known: "):
-        SingleUavEnv(indoor(), leaves=["gps"])
+        single_uav(indoor(), leaves=["gps"])
 
 
 def test_a_uav_alone_needs_nobody() -> None:
-    one = SingleUavEnv(indoor(n_uavs=1), base="ekf")
+    one = single_uav(indoor(n_uavs=1), base="ekf")
     one.reset(seed=0)
     errors = [-one.step(np.zeros(3, np.float32))[1] for _ in range(H)]
     _, _, rewards = episode(one.scenario, ParallelPolicy(make("ekf", one.scenario)), 0)
@@ -282,26 +283,30 @@ def test_a_uav_alone_needs_nobody() -> None:
 
 
 def test_wrong_use_is_named() -> None:
-    one = SingleUavEnv(indoor(), base="none")
+    one = single_uav(indoor(), base="none")
     with refused("indoor-v0: call reset() first"):
         one.step(np.zeros(3, np.float32))
     one.reset(seed=0)
-    words = "indoor-v0: 3 finite numbers are needed: displacement in m within [-1, 1]"
-    for wrong in (np.zeros(9), np.zeros(2), np.array([0.0, np.nan, 0.0])):
-        with refused(words):
-            one.step(wrong.astype(np.float32))
+    needed = "; (3,) finite numbers are needed with action=displacement: displacement in m within"
+    for wrong, words in (
+        (np.zeros(9), "has shape (9,)"),
+        (np.zeros(2, np.float32), "has shape (2,)"),
+        (np.array([0.0, np.nan, 0.0]), "holds NaN or infinity"),
+        (np.zeros(3, complex), "is not made of real numbers"),
+        (None, "is not made of real numbers"),
+    ):
+        with refused(f"indoor-v0: the action of uav_0 {words}{needed}"):
+            one.step(wrong)
     with refused("unknown agent 'efk'"):
-        SingleUavEnv(indoor(), base="efk")
-    with refused("base='mappo:weights=none' is not allowed: a filter, such as ekf or pf500"):
-        SingleUavEnv(indoor(), base="mappo:weights=none")
+        single_uav(indoor(), base="efk")
     with refused("UAVs that fail do not fit rows of one UAV each"):
-        SingleUavEnv(indoor(failure_rate=0.5))
+        single_uav(indoor(failure_rate=0.5))
     with refused("render_mode='ansi' is not allowed"):
-        SingleUavEnv(indoor(), render_mode="ansi")
+        single_uav(indoor(), render_mode="ansi")
 
 
 def test_the_scene_is_drawn() -> None:
-    one = SingleUavEnv(indoor(), render_mode="rgb_array")
+    one = single_uav(indoor(), render_mode="rgb_array")
     one.reset(seed=0)
     one.step(np.zeros(3, np.float32))
     picture = one.render()
@@ -312,11 +317,11 @@ def test_the_scene_is_drawn() -> None:
 
 def test_the_learners_estimate_reaches_the_others() -> None:
     """What it says of itself is what they hear."""
-    one = SingleUavEnv(indoor(), "uav_0", others="ekf", base="none")
+    one = single_uav(indoor(), "uav_0", others="ekf", base="none")
     one.reset(seed=0)
     one.step(np.array([1.0, 0.0, 0.0], np.float32))
-    prior = one._seen["uav_0"]["prior"][:3]
-    heard = one._seen["uav_1"]["messages"][:9]
+    prior = one._observations["uav_0"]["prior"][:3]
+    heard = one._observations["uav_1"]["messages"][:9]
     expected = np.concatenate((prior + np.array([1.0, 0.0, 0.0]), np.zeros(6)))
     np.testing.assert_allclose(heard, expected, atol=1e-5)
     assert torch.isfinite(torch.from_numpy(heard)).all()

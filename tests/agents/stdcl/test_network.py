@@ -1,4 +1,4 @@
-"""The graph network: causal, local, blind to names, places and directions, and gated."""
+"""The graph network: causal, local, equivariant to permutations and rotations, and gated."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,20 +10,20 @@ from hypothesis import strategies as st
 from scipy.stats import ortho_group
 from torch import Tensor
 
-from agents.stdcl.features import SCALARS, Memory, forgotten, look
-from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, carried_over
+from agents.stdcl.features import SCALARS, RunningMeans, graph_inputs, initial_means
+from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, pushed_by_ranges
 from agents.stdcl.network import DILATIONS, StGnn
 from agents.swarm import delays
-from agents.swarm.belief import Found, Prepared
-from agents.swarm.calibration import believed_model
+from agents.swarm.belief import Solution, StepInput
+from agents.swarm.calibration import prior_model
 from agents.swarm.links import Links, lengths, own_information
-from agents.swarm.persistence import believed_chain
+from agents.swarm.persistence import prior_counts
 from agents.weights import untrained
 
 STD, N = 10.0, 14
 
 
-def stirred(seed: int = 0, **chosen: Any) -> StGnn:
+def randomized(seed: int = 0, **chosen: Any) -> StGnn:
     """A network all of whose weights are random, the last layers' included."""
     network = untrained(StGnn, seed, **chosen).double().requires_grad_(False)
     generator = torch.Generator().manual_seed(seed)
@@ -32,8 +32,8 @@ def stirred(seed: int = 0, **chosen: Any) -> StGnn:
     return network
 
 
-def moment(seed: int, reach: float = 900.0) -> tuple[Prepared, Found, Tensor, Tensor]:
-    """A step of two small teams: what it had, what was found, weights and shifts."""
+def step_of(seed: int, reach: float = 900.0) -> tuple[StepInput, Solution, Tensor, Tensor]:
+    """A step of two small teams: its inputs, a solution, weights and shifts."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -47,138 +47,145 @@ def moment(seed: int, reach: float = 900.0) -> tuple[Prepared, Found, Tensor, Te
     fixed[:, :4] = True
     moving = ~fixed.unsqueeze(-1)
     variance = torch.where(fixed, 0.01, 60.0).double()
-    now = Prepared(
+    inputs = StepInput(
         state=torch.cat((place, 20 * normal(2, N, 3)), -1),
-        place=place + moving * 8 * normal(2, N, 3),
+        prior=place + moving * 8 * normal(2, N, 3),
         variance=variance,
-        reckoned=variance,
+        predicted_variance=variance,
         joint=variance.new_zeros(2, N, 1, 0),
-        between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
-        drift=None,
-        delays=delays.begun(place, None),
-        chain=believed_chain(torch.full((2,), 0.1, dtype=torch.float64)),
-        added=torch.full((2, N), 0.3, dtype=torch.float64),
+        pair_variance=variance.unsqueeze(-1) + variance.unsqueeze(-2),
+        ins_bias=None,
+        delays=delays.initial(place, None),
+        transitions=prior_counts(torch.full((2,), 0.1, dtype=torch.float64)),
+        process_noise=torch.full((2, N), 0.3, dtype=torch.float64),
         fixed=fixed,
         links=Links((true + noise + noise.mT) * mask, mask),
-        model=believed_model(2, STD, torch.device("cpu")),
+        error_model=prior_model(2, STD, torch.device("cpu")),
     )
-    found = Found(place + moving * 4 * normal(2, N, 3), torch.where(fixed, 0.01, 20.0).double())
+    found = Solution(place + moving * 4 * normal(2, N, 3), torch.where(fixed, 0.01, 20.0).double())
     weight = mask * torch.rand(2, N, N, generator=generator, dtype=torch.float64) / STD**2
-    return now, found, 0.5 * (weight + weight.mT), torch.zeros(2, N, N, dtype=torch.float64)
+    return inputs, found, 0.5 * (weight + weight.mT), torch.zeros(2, N, N, dtype=torch.float64)
 
 
-def nothing(n: int = N) -> Memory:
-    return forgotten(2, n, 3, torch.device("cpu"))
+def no_means(n: int = N) -> RunningMeans:
+    return initial_means(2, n, 3, torch.device("cpu"))
 
 
-def reach(found: Found) -> Tensor:
-    return 3.0 * found.variance.sqrt()
+def max_offset(solution: Solution) -> Tensor:
+    return 3.0 * solution.variance.sqrt()
 
 
-def answered(network: StGnn, *steps: Any) -> list[Any]:
+def corrections(network: StGnn, *steps: Any) -> list[Any]:
     """The network's corrections over some steps."""
-    memory, past, found = None, None, []
-    for now, where, weight, shift in steps:
-        memory = nothing(now.fixed.shape[1]) if memory is None else memory
-        past = network.start(now.fixed.shape, 3) if past is None else past
-        scene, memory = look(now, where, weight, shift, STD, memory, reach(where))
-        correction, past = network(scene, past)
+    means, past, found = None, None, []
+    for inputs, where, weight, shift in steps:
+        means = no_means(inputs.fixed.shape[1]) if means is None else means
+        past = network.start(inputs.fixed.shape, 3) if past is None else past
+        graph, means = graph_inputs(inputs, where, weight, shift, STD, means, max_offset(where))
+        correction, past = network(graph, past)
         found.append(correction)
     return found
 
 
 def moved(step: Any, turn: Tensor, by: Tensor) -> Any:
     """The same step in a world that was turned (or mirrored) and shifted."""
-    now, found, weight, shift = step
-    state = torch.cat((now.state[..., :3] @ turn + by, now.state[..., 3:] @ turn), -1)
-    now = replace(now, state=state, place=now.place @ turn + by)
-    return now, Found(found.position @ turn + by, found.variance), weight, shift
+    inputs, found, weight, shift = step
+    state = torch.cat((inputs.state[..., :3] @ turn + by, inputs.state[..., 3:] @ turn), -1)
+    inputs = replace(inputs, state=state, prior=inputs.prior @ turn + by)
+    return inputs, Solution(found.position @ turn + by, found.variance), weight, shift
 
 
-def renamed(step: Any, order: Tensor) -> Any:
+def permuted(step: Any, order: Tensor) -> Any:
     """The same step with the UAVs in another order."""
-    now, found, weight, shift = step
+    inputs, found, weight, shift = step
 
     def pairs(x: Tensor) -> Tensor:
         return x[:, order][:, :, order]
 
-    now = replace(
-        now,
-        links=Links(pairs(now.links.distance), pairs(now.links.mask)),
-        **{k: getattr(now, k)[:, order] for k in ("state", "place", "variance", "added", "fixed")},
+    inputs = replace(
+        inputs,
+        links=Links(pairs(inputs.links.distance), pairs(inputs.links.mask)),
+        **{
+            k: getattr(inputs, k)[:, order]
+            for k in ("state", "prior", "variance", "process_noise", "fixed")
+        },
     )
-    found = Found(found.position[:, order], found.variance[:, order])
-    return now, found, pairs(weight), pairs(shift)
+    found = Solution(found.position[:, order], found.variance[:, order])
+    return inputs, found, pairs(weight), pairs(shift)
 
 
 @given(st.integers(0, 1000))
 @settings(max_examples=10, deadline=None)
-def test_corrections_turn_mirror_and_do_not_notice_shifts(seed: int) -> None:
-    steps = [moment(seed + k) for k in range(3)]
+def test_corrections_are_equivariant_to_rotations_and_invariant_to_translations(seed: int) -> None:
+    steps = [step_of(seed + k) for k in range(3)]
     turn = torch.tensor(ortho_group.rvs(3, random_state=seed))
     by = torch.tensor([3e3, -2e4, 500.0], dtype=torch.float64)
-    network = stirred(seed)
-    one = answered(network, *steps)[-1]
-    other = answered(network, *(moved(step, turn, by) for step in steps))[-1]
+    network = randomized(seed)
+    one = corrections(network, *steps)[-1]
+    other = corrections(network, *(moved(step, turn, by) for step in steps))[-1]
     assert one.offset.norm() > 1.0
     assert torch.allclose(other.offset, one.offset @ turn, rtol=1e-6, atol=1e-6)
-    assert torch.allclose(other.spread, one.spread, rtol=1e-7)
+    assert torch.allclose(other.variance_factor, one.variance_factor, rtol=1e-7)
     assert torch.allclose(other.confidence, one.confidence, rtol=1e-7)
 
 
 @given(st.integers(0, 1000))
 @settings(max_examples=10, deadline=None)
-def test_names_do_not_matter(seed: int) -> None:
-    steps = [moment(seed + k) for k in range(3)]
+def test_corrections_are_equivariant_to_permutations(seed: int) -> None:
+    steps = [step_of(seed + k) for k in range(3)]
     order = torch.randperm(N, generator=torch.Generator().manual_seed(seed))
-    network = stirred(seed)
-    one = answered(network, *steps)[-1]
-    other = answered(network, *(renamed(step, order) for step in steps))[-1]
+    network = randomized(seed)
+    one = corrections(network, *steps)[-1]
+    other = corrections(network, *(permuted(step, order) for step in steps))[-1]
     assert torch.allclose(other.offset, one.offset[:, order], rtol=1e-8, atol=1e-9)
     assert torch.allclose(other.confidence, one.confidence[:, order][:, :, order], rtol=1e-8)
 
 
 def test_lengths_in_other_units_give_the_same_corrections() -> None:
-    now, found, weight, shift = moment(4)
+    inputs, found, weight, shift = step_of(4)
     c = 0.01
-    state = c * now.state
-    links = Links(c * now.links.distance, now.links.mask)
-    model = believed_model(2, c * STD, torch.device("cpu"))
+    state = c * inputs.state
+    links = Links(c * inputs.links.distance, inputs.links.mask)
+    model = prior_model(2, c * STD, torch.device("cpu"))
     small = replace(
-        now,
+        inputs,
         state=state,
-        place=c * now.place,
-        variance=c**2 * now.variance,
-        added=c**2 * now.added,
+        prior=c * inputs.prior,
+        variance=c**2 * inputs.variance,
+        process_noise=c**2 * inputs.process_noise,
         links=links,
-        model=model,
+        error_model=model,
     )
-    network = stirred(4)
-    (one,) = answered(network, (now, found, weight, shift))
-    memory, past = nothing(), network.start(now.fixed.shape, 3)
-    scaled = Found(c * found.position, c**2 * found.variance)
-    scene, _ = look(small, scaled, weight / c**2, c * shift, c * STD, memory, reach(scaled))
-    other, _ = network(scene, past)
+    network = randomized(4)
+    (one,) = corrections(network, (inputs, found, weight, shift))
+    means, past = no_means(), network.start(inputs.fixed.shape, 3)
+    scaled = Solution(c * found.position, c**2 * found.variance)
+    graph, _ = graph_inputs(
+        small, scaled, weight / c**2, c * shift, c * STD, means, max_offset(scaled)
+    )
+    other, _ = network(graph, past)
     assert torch.allclose(other.offset, c * one.offset, rtol=1e-7, atol=1e-9)
 
 
 def chain(seed: int) -> Any:
     """A step of a team whose links are a chain: 0 – 1 – 2 – …"""
-    now, found, weight, shift = moment(seed, reach=1e9)
+    inputs, found, weight, shift = step_of(seed, reach=1e9)
     near = torch.arange(N)
     mask = ((near.unsqueeze(0) - near.unsqueeze(1)).abs() == 1).expand(2, -1, -1)
-    links = Links(now.links.distance * mask, mask)
-    return replace(now, links=links), found, weight * mask, shift
+    links = Links(inputs.links.distance * mask, mask)
+    return replace(inputs, links=links), found, weight * mask, shift
 
 
-def test_what_is_three_hops_away_is_not_noticed() -> None:
-    now, found, weight, shift = chain(1)
-    other = now.links.distance.clone()
+def test_a_change_three_hops_away_has_no_effect() -> None:
+    inputs, found, weight, shift = chain(1)
+    other = inputs.links.distance.clone()
     other[:, 10, 11] += 30.0
     other[:, 11, 10] += 30.0
-    changed = (replace(now, links=Links(other, now.links.mask)), found, weight, shift)
-    network = stirred(1)
-    (one,), (two,) = (answered(network, step) for step in ((now, found, weight, shift), changed))
+    changed = (replace(inputs, links=Links(other, inputs.links.mask)), found, weight, shift)
+    network = randomized(1)
+    (one,), (two,) = (
+        corrections(network, step) for step in ((inputs, found, weight, shift), changed)
+    )
     moved = (one.offset - two.offset).norm(dim=-1).amax(0) > 1e-12
     assert moved[10]
     assert moved[11]
@@ -186,11 +193,11 @@ def test_what_is_three_hops_away_is_not_noticed() -> None:
     assert not moved[14:].any()
 
 
-def test_nothing_is_heard_from_the_future() -> None:
-    steps = [moment(k) for k in range(20)]
-    network = stirred(2)
-    before = answered(network, *steps[:12])
-    after = answered(network, *steps)
+def test_corrections_are_causal() -> None:
+    steps = [step_of(k) for k in range(20)]
+    network = randomized(2)
+    before = corrections(network, *steps[:12])
+    after = corrections(network, *steps)
     for one, other in zip(before, after, strict=False):
         assert torch.equal(one.offset, other.offset)
 
@@ -227,66 +234,66 @@ def test_the_receptive_field_in_time() -> None:
     assert sum(one.length for one in StGnn(kernel=3).times) == 2 * sum(DILATIONS)
 
 
-def test_attention_is_a_mean_over_links_and_cuts_the_doubtful_and_fast() -> None:
-    step = moment(7)
-    scene, _ = look(*step, STD, nothing(), reach(step[1]))
-    layer = TopologicalAttention(16, scene.vectors.shape[-1], 4).double().requires_grad_(False)
+def test_attention_is_a_mean_over_links_and_cuts_fast_ones_of_low_confidence() -> None:
+    step = step_of(7)
+    graph, _ = graph_inputs(*step, STD, no_means(), max_offset(step[1]))
+    layer = TopologicalAttention(16, graph.vectors.shape[-1], 4).double().requires_grad_(False)
     mapped = torch.randn(2, N, 16, generator=torch.Generator().manual_seed(1)).double()
-    share = layer.attention(scene, mapped)
-    linked = scene.mask.any(-1)
+    share = layer.attention(graph, mapped)
+    linked = graph.mask.any(-1)
     assert torch.allclose(share.sum(-1)[linked], torch.ones(int(linked.sum())).double())
-    assert (share[~scene.mask] == 0).all()
-    link = scene.link.clone()
+    assert (share[~graph.mask] == 0).all()
+    link = graph.link.clone()
     link[0, 5, :, -1], link[0, 5, :, -2] = 0.1, 1.0
-    far = int(scene.mask[0, 5].nonzero()[0])
+    far = int(graph.mask[0, 5].nonzero()[0])
     link[0, 5, far, -1], link[0, 5, far, -2] = 9.0, 0.05
-    assert layer.attention(replace(scene, link=link), mapped)[0, 5, far] == 0
-    link[0, 5, far, -2] = 0.5  # fast, but trusted
-    assert layer.attention(replace(scene, link=link), mapped)[0, 5, far] > 0
+    assert layer.attention(replace(graph, link=link), mapped)[0, 5, far] == 0
+    link[0, 5, far, -2] = 0.5  # fast, but of high confidence
+    assert layer.attention(replace(graph, link=link), mapped)[0, 5, far] > 0
 
 
-def test_information_and_carried_displacements_are_what_sums_over_links_give() -> None:
-    step = moment(9)
-    scene, _ = look(*step, STD, nothing(), reach(step[1]))
-    y = scene.position
-    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / scene.length.unsqueeze(-1)
-    blocks = torch.einsum("bij,bijx,bijy->bixy", scene.weight, unit, unit)
+def test_information_and_pushed_displacements_are_sums_over_links() -> None:
+    step = step_of(9)
+    graph, _ = graph_inputs(*step, STD, no_means(), max_offset(step[1]))
+    y = graph.position
+    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / graph.length.unsqueeze(-1)
+    blocks = torch.einsum("bij,bijx,bijy->bixy", graph.weight, unit, unit)
     assert torch.allclose(
-        own_information(y, scene.weight, scene.length), blocks, rtol=1e-7, atol=1e-12
+        own_information(y, graph.weight, graph.length), blocks, rtol=1e-7, atol=1e-12
     )
     v = torch.randn(2, N, 3, 4, generator=torch.Generator().manual_seed(3)).double()
-    pushed = torch.einsum("bij,bijx,bijy,bjyc->bixc", scene.weight, unit, unit, v)
-    assert torch.allclose(carried_over(scene, v), scene.gain @ pushed, rtol=1e-6, atol=1e-9)
+    pushed = torch.einsum("bij,bijx,bijy,bjyc->bixc", graph.weight, unit, unit, v)
+    assert torch.allclose(pushed_by_ranges(graph, v), graph.gain @ pushed, rtol=1e-6, atol=1e-9)
 
 
-def test_corrections_are_bounded_and_spare_who_is_fixed() -> None:
-    now, found, weight, shift = moment(11)
-    network = stirred(11)
+def test_corrections_are_bounded_and_anchors_stay() -> None:
+    inputs, found, weight, shift = step_of(11)
+    network = randomized(11)
     network.out.bias += 1e6
-    (correction,) = answered(network, (now, found, weight, shift))
-    most = reach(found)
+    (correction,) = corrections(network, (inputs, found, weight, shift))
+    most = max_offset(found)
     assert (correction.offset.norm(dim=-1) <= most + 1e-9).all()
-    assert (correction.offset[now.fixed] == 0).all()
+    assert (correction.offset[inputs.fixed] == 0).all()
 
 
 def test_an_untrained_network_changes_nothing() -> None:
-    (correction,) = answered(untrained(StGnn, 0).double(), moment(12))
+    (correction,) = corrections(untrained(StGnn, 0).double(), step_of(12))
     assert not correction.offset.any()
-    assert torch.equal(correction.spread, torch.ones_like(correction.spread))
+    assert torch.equal(correction.variance_factor, torch.ones_like(correction.variance_factor))
 
 
 @pytest.mark.parametrize("case", ["no links", "one UAV", "all fixed"])
-def test_what_is_missing_is_no_number(case: str) -> None:
-    now, found, weight, shift = moment(13)
+def test_corrections_are_finite_whatever_is_missing(case: str) -> None:
+    inputs, found, weight, shift = step_of(13)
     if case == "no links":
-        links = Links(torch.zeros_like(weight), torch.zeros_like(now.links.mask))
-        now = replace(now, links=links)
+        links = Links(torch.zeros_like(weight), torch.zeros_like(inputs.links.mask))
+        inputs = replace(inputs, links=links)
         weight = torch.zeros_like(weight)
     elif case == "one UAV":
-        now, found, weight, shift = renamed((now, found, weight, shift), torch.tensor([5]))
+        inputs, found, weight, shift = permuted((inputs, found, weight, shift), torch.tensor([5]))
     else:
-        now = replace(now, fixed=torch.ones_like(now.fixed))
-    (correction,) = answered(stirred(13), (now, found, weight, shift))
+        inputs = replace(inputs, fixed=torch.ones_like(inputs.fixed))
+    (correction,) = corrections(randomized(13), (inputs, found, weight, shift))
     assert correction.offset.isfinite().all()
-    assert correction.spread.isfinite().all()
+    assert correction.variance_factor.isfinite().all()
     assert len(SCALARS) == 21

@@ -12,7 +12,7 @@ from agents import make
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
-from training.evaluation.agreement import team_figures
+from training.evaluation.team import team_figures
 
 STRANGER = 1
 
@@ -132,7 +132,7 @@ def test_broadcast_tells_everybody_everything(tools: SimpleNamespace) -> None:
     counts = {}
     for agent in ("cspf:particles=2", "cspf:particles=2:broadcast=true"):
         belief = tools.play(make(agent, scenario), scenario, [0, 1, 2], 10).beliefs[-1]
-        counts[agent] = belief.window.held.sum(-1)
+        counts[agent] = belief.window.mask.sum(-1)
     own, everyone = counts.values()
     assert (everyone == 10).all()
     assert (own.sum(-1) == 20).all()
@@ -155,13 +155,13 @@ def test_who_is_lost_begins_anew() -> None:
 @pytest.mark.parametrize(
     ("agent", "words"),
     [
-        ("cspf:particles=0", "cspf: particles=0 is not allowed: at least 1"),
-        ("cspf:gamma=0", "cspf: gamma=0.0 is not allowed: a number > 0"),
-        ("cspf:outliers=1", r"cspf: outliers=1.0 is not allowed: a share in \(0, 1\)"),
-        ("cspf:anneal=1.5", r"cspf: anneal=1.5 is not allowed: a factor in \(0, 1\]"),
+        ("cspf:particles=0", "cspf: particles='0' is not allowed: a whole number ≥ 1"),
+        ("cspf:gamma=0", "cspf: gamma='0' is not allowed: a number > 0"),
+        ("cspf:outliers=1", "cspf: outliers='1' is not allowed: a number > 0 and < 1"),
+        ("cspf:anneal=1.5", "cspf: anneal='1.5' is not allowed: a number > 0 and ≤ 1"),
         ("cspf:variant=better", "cspf: variant='better' is not allowed: one of settled"),
-        ("pf_joint:particles=1", "pf_joint: particles=1 is not allowed: at least 2"),
-        ("pose_graph:every=0", "pose_graph: every=0 is not allowed: at least 1"),
+        ("pf_joint:particles=1", "pf_joint: particles='1' is not allowed: a whole number ≥ 2"),
+        ("pose_graph:every=0", "pose_graph: every='0' is not allowed: a whole number ≥ 1"),
     ],
 )
 def test_wrong_options_are_named(agent: str, words: str) -> None:

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from agents.stein import consensus, window
+from agents.stein import consensus
+from agents.stein import match_window as window
 from agents.stein.likelihood import Scale, factors, fit, outlier_level
 from agents.stein.update import kernel, stein_step
 from coloc_env.geometry import Poses, Se2, Se3, poses_in
@@ -24,14 +25,14 @@ def some(poses: type[Poses], *shape: int, seed: int = 0, spread: float = 1.0) ->
     return poses.exp(xi)
 
 
-def one_match(poses: type[Poses], first: int, second: int, pose: Tensor) -> window.Window:
-    told = window.Matches(
+def one_match(poses: type[Poses], first: int, second: int, pose: Tensor) -> window.MatchWindow:
+    new = window.Matches(
         torch.tensor([[[first]]]),
         torch.tensor([[[second]]]),
         pose.view(1, 1, 1, -1),
         torch.ones(1, 1, 1, dtype=torch.bool),
     )
-    return window.stored(window.empty(poses, torch.Size((1, 1)), 3, pose), told)
+    return window.insert(window.empty(poses, torch.Size((1, 1)), 3, pose), new)
 
 
 # ---------------------------------------------------------------- Gauss–Newton targets
@@ -199,7 +200,7 @@ def test_repulsion_is_the_kernels_gradient(dim: int) -> None:
         apart = (poses.split(moved)[0] - poses.split(rest)[0]).square().sum(-1) / 0.7**2
         angle = poses.minus(rest, moved)[..., dim:].square().sum(-1).clamp_min(1e-24).sqrt()
         q = apart + (2 * (0.5 * angle).sin()).square() / 0.9**2
-        k = torch.exp(-0.5 * q.sum(0) / near.h[0, 0])
+        k = torch.exp(-0.5 * q.sum(0) / near.bandwidth[0, 0])
         return -torch.cat((k[:2], k[3:])).sum()
 
     gradient = torch.autograd.functional.jacobian(total, torch.zeros(3, poses.dof).double())
@@ -217,12 +218,12 @@ def scalar_problem(rate: float, steps: int) -> Tensor:
     c[..., 0] = wanted.view(1, 2, 1, 1)
     x = wanted.clone()
     for _ in range(steps):
-        told = c.transpose(1, 2)
-        pull = torch.stack((told[0, 0, 1, 0, 0], told[0, 1, 0, 0, 0]))
-        x = (wanted + gamma * pull) / (1 + gamma)
+        received = c.transpose(1, 2)
+        dual = torch.stack((received[0, 0, 1, 0, 0], received[0, 1, 0, 0, 0]))
+        x = (wanted + gamma * dual) / (1 + gamma)
         estimate = torch.zeros(1, 2, 1, 3, dtype=torch.float64)
         estimate[0, :, 0, 0] = x
-        c = consensus.agreed(Se2, c, told, estimate, rate)
+        c = consensus.dual_update(Se2, c, received, estimate, rate)
     return x
 
 
@@ -248,14 +249,14 @@ def test_the_window_is_a_queue_that_moves_along(poses: type[Poses]) -> None:
     for step in range(12):
         moved = some(poses, n, seed=step, spread=0.3)
         team = poses.compose(team, moved)
-        kept = window.moved(poses, kept, moved.view(1, 1, n, -1), (0.01, 0.02))
+        kept = window.propagate(poses, kept, moved.view(1, 1, n, -1), (0.01, 0.02))
         ends = torch.stack([torch.randperm(n, generator=g)[:2] for _ in range(2)])
         told = torch.rand(2, generator=g) < 0.7
         pose = poses.between(team[ends[:, 0]], team[ends[:, 1]])
         new = window.Matches(*(v[None, None] for v in (ends[:, 0], ends[:, 1], pose, told)))
-        kept = window.stored(kept, new)
+        kept = window.insert(kept, new)
         queue.extend([(*e, step) for e, t in zip(ends.tolist(), told.tolist(), strict=True) if t])
-    held = kept.held[0, 0]
+    held = kept.mask[0, 0]
     found = sorted(
         zip(kept.first[0, 0, held].tolist(), kept.second[0, 0, held].tolist(), strict=True)
     )
@@ -264,33 +265,33 @@ def test_the_window_is_a_queue_that_moves_along(poses: type[Poses]) -> None:
     here = poses.between(team[kept.first[0, 0]], team[kept.second[0, 0]])
     assert float(poses.minus(kept.pose[0, 0], here).abs().max()) < 1e-10
     ages = sorted(11 - step for *_, step in queue)
-    turns = sorted((kept.grown[0, 0, :, 1] / (2 * 0.02**2)).round().long().tolist())
+    turns = sorted((kept.added_variance[0, 0, :, 1] / (2 * 0.02**2)).round().long().tolist())
     assert turns == ages
 
 
-def test_moved_matches_are_as_uncertain_as_said() -> None:
+def test_propagated_matches_have_the_variance_stated() -> None:
     """Monte Carlo: T ← D_i⁻¹ T D_j with noisy odometry, about the truth."""
     g, draws, steps = torch.Generator().manual_seed(0), 4000, 10
     std = (0.005, math.radians(0.2))
     pose = torch.tensor([4.0, -3.0, 0.7]).double()
     shape = torch.Size((1, draws))
     noisy = window.empty(Se2, shape, 1, pose)
-    told = window.Matches(
+    new = window.Matches(
         torch.zeros(1, draws, 1, dtype=torch.int64),
         torch.ones(1, draws, 1, dtype=torch.int64),
         pose.expand(1, draws, 1, 3),
         torch.ones(1, draws, 1, dtype=torch.bool),
     )
-    noisy = window.stored(noisy, told)
+    noisy = window.insert(noisy, new)
     for _ in range(steps):
         xi = torch.randn(1, draws, 2, 3, generator=g, dtype=torch.float64)
         step = Se2.exp(xi * torch.tensor([std[0], std[0], std[1]]))
-        noisy = window.moved(Se2, noisy, step, std)
+        noisy = window.propagate(Se2, noisy, step, std)
     error = Se2.minus(noisy.pose[0, :, 0], pose.expand(draws, 3))
     position = float(error[:, :2].square().sum(-1).mean())
-    said = float(noisy.grown[0, :, 0, 0].mean())
+    said = float(noisy.added_variance[0, :, 0, 0].mean())
     across = 2 * steps * 2 * std[0] ** 2 + 25 * steps * std[1] ** 2  # both axes together
     assert abs(position / across - 1) < 0.1
     assert abs(2 * said / position - 1) < 0.1  # per axis
     turn = float(error[:, 2].square().mean())
-    assert abs(turn / float(noisy.grown[0, :, 0, 1].mean()) - 1) < 0.1
+    assert abs(turn / float(noisy.added_variance[0, :, 0, 1].mean()) - 1) < 0.1

@@ -1,4 +1,4 @@
-"""What clocks and antennas add to ranges, estimated beside the team's positions."""
+"""Delays of clocks and antennas, estimated together with the team's positions."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from agents import make
 from agents.swarm import delays
-from agents.swarm.gauss_newton import gauss_newton, informed
+from agents.swarm.gauss_newton import gauss_newton, information_matrix
 from agents.swarm.links import lengths
 from coloc_env.noise import row_keys
 from coloc_env.scenarios import make_scenario
@@ -28,18 +28,18 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 def ranges(x: Tensor) -> Tensor:
     """Of all pairs i < j, from [positions, (a_i, s_i) of each]; as ``Clock`` defines them."""
-    y, late = x[: N * D].view(N, D), x[N * D :].view(N, 2)
+    y, delay = x[: N * D].view(N, D), x[N * D :].view(N, 2)
     i, j = torch.triu_indices(N, N, 1)
     length = (y[i] - y[j]).norm(dim=-1)
-    return length + late[i, 0] + late[j, 0] + late[i, 1] - late[j, 1]
+    return length + delay[i, 0] + delay[j, 0] + delay[i, 1] - delay[j, 1]
 
 
-def test_what_is_added_is_what_the_clocks_of_the_world_add() -> None:
-    late = 0.2 * random(1, N, 2)
-    x = torch.cat((10 * random(N * D, seed=1), late.flatten()))
+def test_offsets_are_those_of_the_clocks_of_the_world() -> None:
+    delay = 0.2 * random(1, N, 2)
+    x = torch.cat((10 * random(N * D, seed=1), delay.flatten()))
     i, j = torch.triu_indices(N, N, 1)
     expected = ranges(x) - lengths(x[None, : N * D].view(1, N, D))[0, i, j]
-    found = delays.added(late)[0]
+    found = delays.offsets(delay)[0]
     torch.testing.assert_close(found[i, j], expected)
     torch.testing.assert_close(found, found.mT)
 
@@ -52,7 +52,7 @@ def test_information_is_that_of_automatic_differentiation() -> None:
     i, j = torch.triu_indices(N, N, 1)
     weight[i, j] = random(len(i), seed=2).square()
     expected = jacobian.T @ torch.diag(weight[i, j]) @ jacobian
-    found = informed(x[None, : N * D].view(1, N, D), (weight + weight.T)[None], True)[0]
+    found = information_matrix(x[None, : N * D].view(1, N, D), (weight + weight.T)[None], True)[0]
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -65,7 +65,7 @@ def test_positions_and_delays_are_scipys_least_squares() -> None:
     measured = measured + measured.mT
     precision = torch.diag(torch.cat((torch.full((N * D,), 4.0), torch.full((2 * N,), 25.0))))
     fixed = torch.zeros(1, N, dtype=torch.bool)
-    position, late, _ = gauss_newton(
+    position, delay, _ = gauss_newton(
         start,
         measured,
         lambda residual: (100 * (measured > 0).double(), torch.zeros_like(residual)),
@@ -82,33 +82,35 @@ def test_positions_and_delays_are_scipys_least_squares() -> None:
         return torch.cat((10 * (ranges(z) - ranges(x)), spread * (z - prior))).numpy()
 
     best = least_squares(residuals, prior.numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-    found = torch.cat((position.flatten(), late.flatten()))
+    found = torch.cat((position.flatten(), delay.flatten()))
     np.testing.assert_allclose(found, best, atol=1e-6)
 
 
-def test_variance_of_what_is_added() -> None:
+def test_variance_of_offsets() -> None:
     root = 0.1 * random(1, 2 * N, 2 * N)
-    known = delays.begun(torch.zeros(1, N, D, dtype=torch.float64), CLOCK)
+    known = delays.initial(torch.zeros(1, N, D, dtype=torch.float64), CLOCK)
     known = known.replace(common=(root @ root.mT).unflatten(1, (N, 2)))
     draws = (root @ random(2 * N, 20000, seed=1)).mT.reshape(-1, N, 2)
-    every = delays.added(draws)
+    every = delays.offsets(draws)
     i, j = torch.triu_indices(N, N, 1)
-    np.testing.assert_allclose(delays.unsure(known)[0, i, j], every.var(0)[i, j].numpy(), rtol=0.05)
+    np.testing.assert_allclose(
+        delays.offset_variance(known)[0, i, j], every.var(0)[i, j].numpy(), rtol=0.05
+    )
 
 
 def test_antennas_stay_and_clocks_wander() -> None:
-    """After a long time s is as unsure as ever, and a as sure as it was."""
-    known = delays.begun(torch.zeros(1, 2, D, dtype=torch.float64), CLOCK)
+    """After a long time s has its stationary variance again, and a its own as before."""
+    known = delays.initial(torch.zeros(1, 2, D, dtype=torch.float64), CLOCK)
     known = known.replace(delay=torch.ones_like(known.delay), common=0.01 * known.common)
-    kept, still = torch.ones(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.bool)
-    dt = torch.full_like(kept, 1e5)
-    after = delays.carried(known, kept, still, dt, CLOCK)
+    factor, still = torch.ones(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.bool)
+    dt = torch.full_like(factor, 1e5)
+    after = delays.predict(known, factor, still, dt, CLOCK)
     own = after.common.flatten(1, 2).diagonal(dim1=1, dim2=2)[0].view(2, 2)
     np.testing.assert_allclose(own, [[0.01 * 0.2**2, 0.5 * 0.1**2]] * 2)
     np.testing.assert_allclose(after.delay, [[[1.0, 0.0]] * 2], atol=1e-12)
-    once = delays.carried(known, kept, still, dt / 1e4, CLOCK)
-    twice = delays.carried(known, kept, still, dt / 2e4, CLOCK)
-    twice = delays.carried(twice, kept, still, dt / 2e4, CLOCK)
+    once = delays.predict(known, factor, still, dt / 1e4, CLOCK)
+    twice = delays.predict(known, factor, still, dt / 2e4, CLOCK)
+    twice = delays.predict(twice, factor, still, dt / 2e4, CLOCK)
     torch.testing.assert_close(once.common, twice.common)
 
 
@@ -121,7 +123,7 @@ def test_it_pays_where_clocks_are_off(overrides: dict[str, float], tools: Simple
     assert errors[0] < 0.7 * errors[1]
 
 
-def test_delays_of_those_who_know_where_they_are_are_found() -> None:
+def test_delays_of_anchors_are_estimated() -> None:
     scenario = make_scenario("campus-v0", flight="s1", clock_skew=0.0)
     localizer, world = make("map", scenario), World(scenario, 2)
     observation = world.reset(torch.arange(2))

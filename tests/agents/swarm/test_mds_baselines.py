@@ -15,17 +15,17 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from agents import make
-from agents.swarm import delays, window
-from agents.swarm.belief import Prepared, SwarmBelief, begun
-from agents.swarm.calibration import believed_model
-from agents.swarm.fcmds import completed
+from agents.swarm import delays, ins_bias, window
+from agents.swarm.belief import StepInput, SwarmBelief, with_finite_prior
+from agents.swarm.calibration import prior_model
+from agents.swarm.fcmds import completed_step
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.gauss_newton import fisher
 from agents.swarm.links import Links, connected, lengths
-from agents.swarm.majorization import majorizer, nodewise, own_pull, stress
-from agents.swarm.persistence import believed_chain
+from agents.swarm.majorization import jacobi_diagonal, jacobi_step, majorizer, stress
+from agents.swarm.persistence import prior_counts
 from agents.swarm.scaling import classical_scaling
-from agents.swarm.spread import spread, told
+from agents.swarm.uncertainty import anchor_information, position_variance
 from agents.swarm.weights import loess
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
@@ -33,10 +33,10 @@ from coloc_env.world import World
 
 STD = 10.0
 METHODS = ("dwmds", "vmds", "fcmds")
-SMALL: dict[str, Any] = {"n_uavs": 30, "anchors": 0.3, "ins_bias": 0.0, "comm_radius": 6000.0}
+SMALL: dict[str, Any] = {"n_uavs": 30, "anchor_share": 0.3, "ins_bias": 0.0, "comm_radius": 6000.0}
 
 
-def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> Prepared:
+def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> StepInput:
     """Random places in a cube of 1 km, noisy ranges within reach, five who are fixed, the others'
     places dead-reckoned to 30 m."""
     generator = torch.Generator().manual_seed(seed)
@@ -51,22 +51,22 @@ def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> Prepa
     noise = torch.triu(normal(worlds, n, n), 1)
     fixed = torch.zeros(worlds, n, dtype=torch.bool)
     fixed[:, :5] = True
-    place_now = torch.where(fixed.unsqueeze(-1), place, place + 30 * normal(worlds, n, 3))
+    prior = torch.where(fixed.unsqueeze(-1), place, place + 30 * normal(worlds, n, 3))
     variance = torch.where(fixed, 0.01, 900.0).double()
-    return Prepared(
-        state=torch.cat((place_now, torch.zeros_like(place)), -1),
-        place=place_now,
+    return StepInput(
+        state=torch.cat((prior, torch.zeros_like(place)), -1),
+        prior=prior,
         variance=variance,
-        added=torch.zeros_like(variance),
-        reckoned=variance,
+        process_noise=torch.zeros_like(variance),
+        predicted_variance=variance,
         joint=variance.new_zeros(worlds, n, 1, 0),
-        between=variance.unsqueeze(-1) + variance.unsqueeze(-2),
-        drift=None,
-        delays=delays.begun(place, None),
-        chain=believed_chain(torch.full((worlds,), 0.1, dtype=torch.float64)),
+        pair_variance=variance.unsqueeze(-1) + variance.unsqueeze(-2),
+        ins_bias=None,
+        delays=delays.initial(place, None),
+        transitions=prior_counts(torch.full((worlds,), 0.1, dtype=torch.float64)),
         fixed=fixed,
         links=Links((true + STD * (noise + noise.mT)) * mask, mask),
-        model=believed_model(worlds, STD, torch.device("cpu")),
+        error_model=prior_model(worlds, STD, torch.device("cpu")),
     )
 
 
@@ -76,41 +76,42 @@ def method(agent: str) -> SwarmFilter:
     return localizer
 
 
-def belief(now: Prepared, step: int = 1) -> SwarmBelief:
-    """All that the three look at: the count of steps."""
-    shape = now.fixed.shape
+def belief(inputs: StepInput, step: int = 1) -> SwarmBelief:
+    """A belief of which the three use the count of steps only."""
+    shape = inputs.fixed.shape
     return SwarmBelief(
-        state=torch.cat((now.place, now.place), -1),
-        variance=now.variance,
-        joint=now.joint,
-        bias=torch.zeros_like(now.place),
-        drift=torch.zeros_like(now.place[..., :2]),
-        chain=now.chain.unsqueeze(1).expand(-1, shape[1], -1, -1),
-        memory=now.variance.new_zeros(*shape, 0),
-        localizable=now.fixed,
+        state=torch.cat((inputs.prior, inputs.prior), -1),
+        variance=inputs.variance,
+        joint=inputs.joint,
+        ins_bias=ins_bias.initial(inputs.prior, None),
+        transitions=inputs.transitions.unsqueeze(1).expand(-1, shape[1], -1, -1),
+        link_memory=inputs.variance.new_zeros(*shape, 0),
+        localizable=inputs.fixed,
         step=torch.full(shape, step),
-        errors=now.model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
-        past=window.begun(now.place, now.joint, 0),
-        delays=now.delays,
+        error_sums=inputs.error_model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
+        window=window.empty(inputs.prior, inputs.joint, 0),
+        delays=inputs.delays,
         batch_size=shape,
     )
 
 
-def minimum(now: Prepared, weight: Tensor, trust: Tensor) -> np.ndarray:
+def minimum(inputs: StepInput, weight: Tensor, precision: Tensor) -> np.ndarray:
     """Where scipy finds the least stress of the first world, from where dead reckoning is."""
-    free = ~now.fixed[0]
+    free = ~inputs.fixed[0]
 
     def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
         moved = torch.from_numpy(flat).view(-1, 3).requires_grad_(True)
-        y = now.place[:1].clone()
+        y = inputs.prior[:1].clone()
         y = y.index_put((torch.zeros(int(free.sum()), dtype=torch.int64), free.nonzero()[:, 0]),
                         moved)  # fmt: skip
-        value = stress(y, now.links.distance[:1], weight[:1], now.place[:1], trust[:1]).sum()
+        value = stress(
+            y, inputs.links.distance[:1], weight[:1], inputs.prior[:1], precision[:1]
+        ).sum()
         value.backward()
         assert moved.grad is not None
         return float(value.detach()), moved.grad.numpy().ravel()
 
-    start = now.place[0, free].numpy().ravel()
+    start = inputs.prior[0, free].numpy().ravel()
     best = minimize(cost, start, jac=True, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000})
     return best.x.reshape(-1, 3)
 
@@ -120,59 +121,59 @@ def minimum(now: Prepared, weight: Tensor, trust: Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("prior_weight", [0.0, 1.0])
 def test_dwmds_ends_where_scipy_finds_the_least_stress(prior_weight: float) -> None:
-    now = team(1)
+    inputs = team(1)
     agent = f"dwmds:bandwidth=1:prior_weight={prior_weight}:iterations=4000:first=4000"
-    found = method(agent).find(belief(now), now)
-    weight = loess(now.links.distance, now.links.mask, 1.0) / STD**2
-    trust = torch.where(now.fixed, 0.0, prior_weight / now.variance)
-    best = minimum(now, weight, trust)
-    np.testing.assert_allclose(found.position[0, ~now.fixed[0]], best, atol=1e-2)
+    found = method(agent).solve(belief(inputs), inputs)
+    weight = loess(inputs.links.distance, inputs.links.mask, 1.0) / STD**2
+    precision = torch.where(inputs.fixed, 0.0, prior_weight / inputs.variance)
+    best = minimum(inputs, weight, precision)
+    np.testing.assert_allclose(found.position[0, ~inputs.fixed[0]], best, atol=1e-2)
 
 
 @pytest.mark.parametrize("step", [0, 1])
 def test_vmds_ends_where_scipy_finds_the_least_stress(step: int) -> None:
-    now = team(2)
+    inputs = team(2)
     agent = "vmds:velocity_weight=0.02:confidence=none:iterations=2000:first=2000"
-    found = method(agent).find(belief(now, step), now)
-    weight = now.links.mask.double() / STD**2
-    trust = torch.where(now.fixed, 0.0, 0.02 if step else 1 / now.variance)
-    best = minimum(now, weight, trust)
-    np.testing.assert_allclose(found.position[0, ~now.fixed[0]], best, atol=1e-2)
+    found = method(agent).solve(belief(inputs, step), inputs)
+    weight = inputs.links.mask.double() / STD**2
+    precision = torch.where(inputs.fixed, 0.0, 0.02 if step else 1 / inputs.variance)
+    best = minimum(inputs, weight, precision)
+    np.testing.assert_allclose(found.position[0, ~inputs.fixed[0]], best, atol=1e-2)
 
 
 def test_fcmds_ends_where_scipy_finds_the_least_stress() -> None:
-    now = team(3)
-    found = method("fcmds:iterations=4000:first=4000").find(belief(now), now)
-    best = minimum(now, now.links.mask.double() / STD**2, torch.zeros_like(now.variance))
-    np.testing.assert_allclose(found.position[0, ~now.fixed[0]], best, atol=1e-2)
+    inputs = team(3)
+    found = method("fcmds:iterations=4000:first=4000").solve(belief(inputs), inputs)
+    best = minimum(inputs, inputs.links.mask.double() / STD**2, torch.zeros_like(inputs.variance))
+    np.testing.assert_allclose(found.position[0, ~inputs.fixed[0]], best, atol=1e-2)
 
 
 def test_the_velocity_term_is_that_of_dead_reckoning() -> None:
     """λ_s ‖(p(t) − p(t−1))/Δt − v‖² = λ_s/Δt² ‖p(t) − (p(t−1) + v Δt)‖²: half the
     step in time, four times the weight in space."""
-    now = team(4)
+    inputs = team(4)
     slow = method("vmds:velocity_weight=0.04")
     fast = make("vmds:velocity_weight=0.01", make_scenario("swarm-v0", dt=0.5))
     assert isinstance(fast, SwarmFilter)
-    one, other = (x.find(belief(now), now).position for x in (slow, fast))
+    one, other = (x.solve(belief(inputs), inputs).position for x in (slow, fast))
     assert torch.allclose(one, other, atol=1e-9)
 
 
 @given(st.integers(0, 1000), st.floats(300.0, 1800.0), st.floats(0.0, 1e-2))
 @settings(max_examples=15, deadline=None)
-def test_sweeps_never_raise_the_stress(seed: int, reach: float, held: float) -> None:
-    now = team(seed, reach=reach)
-    weight = loess(now.links.distance, now.links.mask, 1.0) / STD**2
-    trust = torch.full_like(now.variance, held).masked_fill(now.fixed, 0.0)
-    parts = (now.links.distance, weight, now.place, trust)
-    y = now.place + 100.0 * ~now.fixed.unsqueeze(-1)
+def test_sweeps_never_raise_the_stress(seed: int, reach: float, precision: float) -> None:
+    inputs = team(seed, reach=reach)
+    weight = loess(inputs.links.distance, inputs.links.mask, 1.0) / STD**2
+    lam = torch.full_like(inputs.variance, precision).masked_fill(inputs.fixed, 0.0)
+    parts = (inputs.links.distance, weight, inputs.prior, lam)
+    y = inputs.prior + 100.0 * ~inputs.fixed.unsqueeze(-1)
     before = stress(y, *parts)
     for _ in range(20):
-        y = nodewise(y, *parts, now.fixed)
+        y = jacobi_step(y, *parts, inputs.fixed)
         after = stress(y, *parts)
         assert (after <= before * (1 + 1e-12)).all()
         before = after
-    assert torch.equal(y[now.fixed], now.place[now.fixed])
+    assert torch.equal(y[inputs.fixed], inputs.prior[inputs.fixed])
 
 
 @given(st.integers(0, 1000), st.floats(300.0, 1800.0), st.booleans())
@@ -180,51 +181,51 @@ def test_sweeps_never_raise_the_stress(seed: int, reach: float, held: float) -> 
 def test_completing_never_raises_the_stress_of_what_was_measured(
     seed: int, reach: float, anchored: bool
 ) -> None:
-    now = team(seed, reach=reach)
-    fixed = now.fixed if anchored else torch.zeros_like(now.fixed)
-    weight, nothing = now.links.mask.double(), torch.zeros_like(now.variance)
-    together = connected(now.links.mask)
-    y = now.place + 100.0 * torch.sin(now.place)
-    before = stress(y, now.links.distance, weight, y, nothing)
+    inputs = team(seed, reach=reach)
+    fixed = inputs.fixed if anchored else torch.zeros_like(inputs.fixed)
+    weight, nothing = inputs.links.mask.double(), torch.zeros_like(inputs.variance)
+    component = connected(inputs.links.mask)
+    y = inputs.prior + 100.0 * torch.sin(inputs.prior)
+    before = stress(y, inputs.links.distance, weight, y, nothing)
     for _ in range(20):
-        y = completed(y, now.links.distance, now.links.mask, together, fixed)
-        after = stress(y, now.links.distance, weight, y, nothing)
+        y = completed_step(y, inputs.links.distance, inputs.links.mask, component, fixed)
+        after = stress(y, inputs.links.distance, weight, y, nothing)
         assert (after <= before * (1 + 1e-12)).all()
         before = after
 
 
 def test_the_sweeps_diagonal_is_no_less_than_the_laplacian() -> None:
-    now = team(5)
-    weight = now.links.mask.double()
-    factor = majorizer(weight, torch.zeros_like(now.variance), now.fixed)
+    inputs = team(5)
+    weight = inputs.links.mask.double()
+    factor = majorizer(weight, torch.zeros_like(inputs.variance), inputs.fixed)
     laplacian = factor @ factor.mT
-    bound = own_pull(weight, now.fixed).masked_fill(now.fixed, 1.0)
+    bound = jacobi_diagonal(weight, inputs.fixed).masked_fill(inputs.fixed, 1.0)
     assert (torch.linalg.eigvalsh(torch.diag_embed(bound) - laplacian) > -1e-9).all()
 
 
 def test_without_anchors_and_with_all_distances_fcmds_is_scikit_learns() -> None:
     """Its SMACOF minimizes the same stress of a fully connected network."""
     manifold = pytest.importorskip("sklearn.manifold")
-    now = team(6, worlds=1, reach=2000.0)
-    distance = now.links.distance
+    inputs = team(6, worlds=1, reach=2000.0)
+    distance = inputs.links.distance
     start = classical_scaling(distance, 3)
-    nobody, all_of_them = torch.zeros_like(now.fixed), connected(now.links.mask)
+    nobody, all_of_them = torch.zeros_like(inputs.fixed), connected(inputs.links.mask)
     y = start
     for _ in range(2000):
-        y = completed(y, distance, now.links.mask, all_of_them, nobody)
+        y = completed_step(y, distance, inputs.links.mask, all_of_them, nobody)
     _, best = manifold.smacof(
         distance[0].numpy(), n_components=3, init=start[0].numpy(), n_init=1, max_iter=3000,
         eps=1e-12, normalized_stress=False,
     )  # fmt: skip
-    nothing = torch.zeros_like(now.variance)
-    found = stress(y, distance, now.links.mask.double(), y, nothing)
+    nothing = torch.zeros_like(inputs.variance)
+    found = stress(y, distance, inputs.links.mask.double(), y, nothing)
     assert float(found) == pytest.approx(best, rel=1e-5)
 
 
 def test_connected_parts_are_scipys() -> None:
-    now = team(7, n=30, reach=250.0)
-    found = connected(now.links.mask)
-    for one, mask in zip(found, now.links.mask, strict=True):
+    inputs = team(7, n=30, reach=250.0)
+    found = connected(inputs.links.mask)
+    for one, mask in zip(found, inputs.links.mask, strict=True):
         count, label = connected_components(mask.numpy(), directed=False)
         assert count > 3
         np.testing.assert_array_equal(one, label[:, None] == label[None])
@@ -240,109 +241,116 @@ def test_loess_weights_are_one_near_by_and_less_far_off() -> None:
     assert torch.equal(loess(0 * distance, mask & False, 1.0), torch.zeros_like(distance))
 
 
-# ---------------------------------------------------------------- how sure
+# ---------------------------------------------------------------- variances
 
 
-def test_what_anchors_tell_is_fishers_information() -> None:
+def test_information_of_anchors_is_fishers() -> None:
     """A UAV whose neighbours are all fixed: exactly."""
-    now = team(8, worlds=1, n=6, reach=2000.0)
-    weight, variance = now.links.mask.double() / STD**2, torch.zeros_like(now.variance)
-    exact = lengths(now.place) * now.links.mask
-    found = told(now.place, exact, weight, now.fixed, variance, STD)
-    expected = fisher(now.place, weight)[0, 5, :, 5]
+    inputs = team(8, worlds=1, n=6, reach=2000.0)
+    weight, variance = inputs.links.mask.double() / STD**2, torch.zeros_like(inputs.variance)
+    exact = lengths(inputs.prior) * inputs.links.mask
+    found = anchor_information(inputs.prior, exact, weight, inputs.fixed, variance, STD)
+    expected = fisher(inputs.prior, weight)[0, 5, :, 5]
     assert torch.allclose(found[0, 5], expected, rtol=1e-8)
-    sure = spread(found, torch.full_like(variance, 1e-9), torch.ones_like(variance), now.fixed)
+    sure = position_variance(
+        found, torch.full_like(variance, 1e-9), torch.ones_like(variance), inputs.fixed
+    )
     expected_variance = torch.linalg.inv(expected).diagonal().mean()
     assert float(sure[0, 5]) == pytest.approx(float(expected_variance), rel=1e-4)
 
 
-def test_larger_residuals_tell_less() -> None:
-    now = team(9)
-    weight = now.links.mask.double()
-    parts = (weight, now.fixed, now.variance, STD)
-    exact = lengths(now.place)
-    good, bad = (told(now.place, d * now.links.mask, *parts) for d in (exact, exact + 40.0))
-    assert (torch.linalg.eigvalsh(good - bad)[~now.fixed] > -1e-12).all()
-    assert (good - bad)[~now.fixed].flatten(1).norm(dim=-1).min() > 0
+def test_larger_residuals_have_less_information() -> None:
+    inputs = team(9)
+    weight = inputs.links.mask.double()
+    parts = (weight, inputs.fixed, inputs.variance, STD)
+    exact = lengths(inputs.prior)
+    good, bad = (
+        anchor_information(inputs.prior, d * inputs.links.mask, *parts)
+        for d in (exact, exact + 40.0)
+    )
+    assert (torch.linalg.eigvalsh(good - bad)[~inputs.fixed] > -1e-12).all()
+    assert (good - bad)[~inputs.fixed].flatten(1).norm(dim=-1).min() > 0
 
 
-def test_without_anchors_ranges_tell_nothing() -> None:
-    now = team(10)
-    nobody = torch.zeros_like(now.fixed)
-    weight = now.links.mask.double() / STD**2
-    found = told(now.place, now.links.distance, weight, nobody, now.variance, STD)
-    variance = spread(found, torch.ones_like(now.variance), now.variance, nobody)
-    assert torch.allclose(variance, now.variance)
+def test_without_anchors_ranges_have_no_information() -> None:
+    inputs = team(10)
+    nobody = torch.zeros_like(inputs.fixed)
+    weight = inputs.links.mask.double() / STD**2
+    found = anchor_information(
+        inputs.prior, inputs.links.distance, weight, nobody, inputs.variance, STD
+    )
+    variance = position_variance(found, torch.ones_like(inputs.variance), inputs.variance, nobody)
+    assert torch.allclose(variance, inputs.variance)
 
 
 def test_the_spread_of_a_weighted_mean() -> None:
-    """By simulation: a start off by N(0, P), ranges that tell J, a mean with weights λ and J."""
+    """By simulation: a prior with error N(0, P), ranges with information J, weights λ and J."""
     generator = torch.Generator().manual_seed(0)
-    j, held, p = 0.04, 0.01, 50.0
-    start, told_by = torch.randn(2, 200_000, generator=generator, dtype=torch.float64)
-    off = (held * p**0.5 * start + j * told_by / j**0.5) / (held + j)
+    j, lam, p = 0.04, 0.01, 50.0
+    start, ranged = torch.randn(2, 200_000, generator=generator, dtype=torch.float64)
+    off = (lam * p**0.5 * start + j * ranged / j**0.5) / (lam + j)
     one = torch.ones(1, 1, dtype=torch.float64)
-    found = spread(j * torch.eye(3).double()[None, None], held * one, p * one, one < 0)
+    found = position_variance(j * torch.eye(3).double()[None, None], lam * one, p * one, one < 0)
     assert float(found) == pytest.approx(float(off.square().mean()), rel=0.02)
 
 
 # ---------------------------------------------------------------- whole steps
 
 
-def permuted(now: Prepared, order: Tensor) -> Prepared:
+def permuted(inputs: StepInput, order: Tensor) -> StepInput:
     return replace(
-        now,
-        place=now.place[:, order],
-        variance=now.variance[:, order],
-        reckoned=now.reckoned[:, order],
-        between=now.between[:, order][:, :, order],
-        fixed=now.fixed[:, order],
+        inputs,
+        prior=inputs.prior[:, order],
+        variance=inputs.variance[:, order],
+        predicted_variance=inputs.predicted_variance[:, order],
+        pair_variance=inputs.pair_variance[:, order][:, :, order],
+        fixed=inputs.fixed[:, order],
         links=Links(
-            now.links.distance[:, order][:, :, order], now.links.mask[:, order][:, :, order]
+            inputs.links.distance[:, order][:, :, order], inputs.links.mask[:, order][:, :, order]
         ),
     )
 
 
 @pytest.mark.parametrize("agent", [*METHODS, "fcmds:start=paths", "dwmds:reach=600"])
-def test_names_of_uavs_do_not_matter(agent: str) -> None:
-    now = team(11)
+def test_they_are_equivariant_to_permutations(agent: str) -> None:
+    inputs = team(11)
     order = torch.randperm(14, generator=torch.Generator().manual_seed(1))
-    found, again = (method(agent).find(belief(x), x) for x in (now, permuted(now, order)))
+    found, again = (method(agent).solve(belief(x), x) for x in (inputs, permuted(inputs, order)))
     assert torch.allclose(found.position[:, order], again.position, atol=1e-6)
     assert torch.allclose(found.variance[:, order], again.variance, rtol=1e-6)
 
 
 def test_reach_drops_neighbours_that_are_far_by_dead_reckoning() -> None:
-    now = team(12)
-    near = lengths(now.place) <= 500.0
-    fewer = replace(now, links=Links(now.links.distance * near, now.links.mask & near))
-    found = method("dwmds:reach=500:bandwidth=inf").find(belief(now), now)
-    expected = method("dwmds:bandwidth=inf").find(belief(now), fewer)
+    inputs = team(12)
+    near = lengths(inputs.prior) <= 500.0
+    fewer = replace(inputs, links=Links(inputs.links.distance * near, inputs.links.mask & near))
+    found = method("dwmds:reach=500:bandwidth=inf").solve(belief(inputs), inputs)
+    expected = method("dwmds:bandwidth=inf").solve(belief(inputs), fewer)
     assert torch.equal(found.position, expected.position)
-    everybody = method("dwmds:bandwidth=inf").find(belief(now), now)
+    everybody = method("dwmds:bandwidth=inf").solve(belief(inputs), inputs)
     assert not torch.equal(found.position, everybody.position)
 
 
 @pytest.mark.parametrize("agent", [*METHODS, "fcmds:start=paths"])
-def test_a_prior_that_is_no_number_is_made_up_for_by_ranges(agent: str) -> None:
-    now = team(13, reach=2000.0)
-    place = now.place.clone()
+def test_a_prior_that_is_not_finite_is_replaced_by_ranges(agent: str) -> None:
+    inputs = team(13, reach=2000.0)
+    place = inputs.prior.clone()
     place[0, 9] = torch.nan
     off = place.clone()
-    localizer, lost = method(agent), replace(now, place=place)
+    localizer, lost = method(agent), replace(inputs, prior=place)
     for _ in range(40):
-        found = localizer.find(belief(lost, 0), lost)
+        found = localizer.solve(belief(lost, 0), lost)
         between = found.variance.unsqueeze(-1) + found.variance.unsqueeze(-2)
-        lost = replace(lost, place=found.position, variance=found.variance, between=between)
-    usual = localizer.find(belief(now, 0), now)
+        lost = replace(lost, prior=found.position, variance=found.variance, pair_variance=between)
+    usual = localizer.solve(belief(inputs, 0), inputs)
     for _ in range(39):
-        usual = localizer.find(
-            belief(now, 0),
+        usual = localizer.solve(
+            belief(inputs, 0),
             replace(
-                now,
-                place=usual.position,
+                inputs,
+                prior=usual.position,
                 variance=usual.variance,
-                between=usual.variance.unsqueeze(-1) + usual.variance.unsqueeze(-2),
+                pair_variance=usual.variance.unsqueeze(-1) + usual.variance.unsqueeze(-2),
             ),
         )
     assert found.position.isfinite().all()
@@ -352,26 +360,28 @@ def test_a_prior_that_is_no_number_is_made_up_for_by_ranges(agent: str) -> None:
     assert off[0, 9].isnan().all()  # not written to
 
 
-def test_who_has_no_place_and_no_neighbour_begins_in_the_middle() -> None:
-    now = team(14, worlds=1)
-    place, mask = now.place.clone(), now.links.mask.clone()
+def test_a_uav_without_prior_and_neighbours_starts_at_the_mean() -> None:
+    inputs = team(14, worlds=1)
+    place, mask = inputs.prior.clone(), inputs.links.mask.clone()
     place[0, 9] = torch.nan
     mask[0, 9] = mask[0, :, 9] = False
-    found = begun(replace(now, place=place, links=Links(now.links.distance, mask)))
+    found = with_finite_prior(
+        replace(inputs, prior=place, links=Links(inputs.links.distance, mask))
+    )
     others = torch.arange(14) != 9
-    assert torch.allclose(found.place[0, 9], place[0, others].mean(0))
+    assert torch.allclose(found.prior[0, 9], place[0, others].mean(0))
     assert found.variance[0, 9] > 1e9
-    assert torch.equal(found.variance[0, others], now.variance[0, others])
+    assert torch.equal(found.variance[0, others], inputs.variance[0, others])
 
 
-def flown(agent: str, steps: int = 6, **overrides: Any) -> tuple[Tensor, Tensor, Tensor]:
+def episode(agent: str, steps: int = 6, **overrides: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Errors, positions and covariances of one world, step by step."""
     scenario = make_scenario("swarm-v0", **SMALL | overrides)
     localizer, world = make(agent, scenario), World(scenario, 1)
     observation = world.reset(torch.tensor([0]))
-    now, found = localizer.reset(observation), []
+    inputs, found = localizer.reset(observation), []
     for _ in range(steps):
-        now, estimate = localizer.step(now, observation)
+        inputs, estimate = localizer.step(inputs, observation)
         error = (estimate.position - world.truth.position).norm(dim=-1)
         found.append((error, estimate.position, estimate.covariance))
         world.advance(estimate.action())
@@ -382,11 +392,11 @@ def flown(agent: str, steps: int = 6, **overrides: Any) -> tuple[Tensor, Tensor,
 
 @pytest.mark.parametrize("agent", METHODS)
 def test_they_localize(agent: str) -> None:
-    error, _, _ = flown(agent, 15, nlos=0.0)
-    reckoned, _, _ = flown("dead_reckoning", 15, nlos=0.0)
-    guides = 9
-    assert error[5:, :, guides:].square().mean().sqrt() < 12.0
-    assert reckoned[5:, :, guides:].square().mean().sqrt() > 60.0
+    error, _, _ = episode(agent, 15, nlos=0.0)
+    reckoned, _, _ = episode("dead_reckoning", 15, nlos=0.0)
+    anchors = 9
+    assert error[5:, :, anchors:].square().mean().sqrt() < 12.0
+    assert reckoned[5:, :, anchors:].square().mean().sqrt() > 60.0
 
 
 @pytest.mark.parametrize("agent", [*METHODS, "fcmds:start=paths", "dwmds:prior_weight=0"])
@@ -395,32 +405,32 @@ def test_they_localize(agent: str) -> None:
     [
         {"comm_radius": 1.0},  # nobody hears anybody
         {"comm_radius": 1500.0},  # in pieces, some without an anchor
-        {"anchors": 0.0},
+        {"anchor_share": 0.0},
         {"link_failure": 1.0},
-        {"n_uavs": 1, "anchors": 0.0},
-        {"n_uavs": 2, "anchors": 0.5},
+        {"n_uavs": 1, "anchor_share": 0.0},
+        {"n_uavs": 2, "anchor_share": 0.5},
         {"failure_rate": 1.0, "horizon": 4},
     ],
     ids=str,
 )
 def test_no_network_is_too_broken(agent: str, overrides: dict[str, Any]) -> None:
-    _, position, covariance = flown(agent, 4, **overrides)
+    _, position, covariance = episode(agent, 4, **overrides)
     assert position.isfinite().all()
     assert (torch.linalg.eigvalsh(covariance) > 0).all()
 
 
 @pytest.mark.parametrize("agent", METHODS)
-def test_who_hears_nobody_dead_reckons_and_says_how_unsure_it_is(agent: str) -> None:
-    _, alone, covariance = flown(agent, comm_radius=1.0)
-    _, reckoned, expected = flown("dead_reckoning", comm_radius=1.0)
-    guides = 9
-    assert torch.allclose(alone[..., guides:, :], reckoned[..., guides:, :], atol=1e-3)
-    assert torch.allclose(covariance[:, :, guides:], expected[:, :, guides:], rtol=1e-4)
+def test_without_links_they_dead_reckon_with_its_covariance(agent: str) -> None:
+    _, alone, covariance = episode(agent, comm_radius=1.0)
+    _, reckoned, expected = episode("dead_reckoning", comm_radius=1.0)
+    anchors = 9
+    assert torch.allclose(alone[..., anchors:, :], reckoned[..., anchors:, :], atol=1e-3)
+    assert torch.allclose(covariance[:, :, anchors:], expected[:, :, anchors:], rtol=1e-4)
 
 
 @pytest.mark.parametrize("agent", METHODS)
-def test_a_team_without_anchors_grows_ever_less_sure(agent: str) -> None:
-    _, _, covariance = flown(agent, anchors=0.0)
+def test_without_anchors_variances_grow(agent: str) -> None:
+    _, _, covariance = episode(agent, anchor_share=0.0)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     assert (variance.diff(dim=0)[1:] > 0).all()
     assert (variance[-1] >= 2500.0).all()
@@ -429,14 +439,14 @@ def test_a_team_without_anchors_grows_ever_less_sure(agent: str) -> None:
 @pytest.mark.parametrize(
     ("agent", "words"),
     [
-        ("dwmds:bandwidth=0", "bandwidth=0.0 is not allowed"),
-        ("dwmds:prior_weight=-1", "prior_weight=-1.0 is not allowed"),
-        ("dwmds:prior_weight=inf", "prior_weight=inf is not allowed"),
-        ("dwmds:reach=0", "reach=0.0 is not allowed"),
-        ("dwmds:iterations=0", "iterations=0, first=60 is not allowed"),
-        ("vmds:velocity_weight=0", "velocity_weight=0.0 is not allowed"),
+        ("dwmds:bandwidth=0", "bandwidth='0' is not allowed"),
+        ("dwmds:prior_weight=-1", "prior_weight='-1' is not allowed"),
+        ("dwmds:prior_weight=inf", "prior_weight='inf' is not allowed"),
+        ("dwmds:reach=0", "reach='0' is not allowed"),
+        ("dwmds:iterations=0", "iterations='0' is not allowed"),
+        ("vmds:velocity_weight=0", "velocity_weight='0' is not allowed"),
         ("vmds:iterations=31", "iterations=31, first=30 is not allowed"),
-        ("fcmds:iterations=0", "iterations=0, first=60 is not allowed"),
+        ("fcmds:iterations=0", "iterations='0' is not allowed"),
         ("fcmds:start=here", "start='here' is not allowed"),
     ],
 )
@@ -445,7 +455,7 @@ def test_wrong_options(agent: str, words: str) -> None:
         make(agent, make_scenario("swarm-v0"))
 
 
-def test_observations_without_any_number_do_not_stop_anybody() -> None:
+def test_observations_of_nan_give_finite_estimates() -> None:
     scenario = make_scenario("swarm-v0", **SMALL)
     world = World(scenario, 1)
     first = world.reset(torch.tensor([0]))

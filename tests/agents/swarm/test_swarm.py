@@ -15,11 +15,11 @@ from scipy.sparse.csgraph import floyd_warshall
 from scipy.stats import norm
 from torch import Tensor
 
-from agents.swarm import calibration, drift, joint, persistence, weights
+from agents.swarm import calibration, ins_bias, joint, persistence, weights
 from agents.swarm.gauss_newton import fisher, gauss_newton
 from agents.swarm.links import lengths, links_of
-from agents.swarm.majorization import descent, guttman, majorizer, stress
-from agents.swarm.scaling import aligned, classical_scaling, shortest_paths
+from agents.swarm.majorization import descent, guttman_step, majorizer, stress
+from agents.swarm.scaling import classical_scaling, procrustes, shortest_paths
 from coloc_env.observation import Observation
 from coloc_env.sensors import Ins
 
@@ -107,7 +107,7 @@ def test_alignment_undoes_any_similarity(seed: int, scale: float) -> None:
     turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
     weight = torch.zeros(2, 12, dtype=torch.float64)
     weight[:, :5] = 1.0
-    assert torch.allclose(aligned(scale * place @ turn + 7.0, place, weight), place, atol=1e-6)
+    assert torch.allclose(procrustes(scale * place @ turn + 7.0, place, weight), place, atol=1e-6)
 
 
 def test_alignment_turns_as_scipy_does() -> None:
@@ -115,7 +115,7 @@ def test_alignment_turns_as_scipy_does() -> None:
     a, b = (x[0] - x[0].mean(0) for x in (world["prior"], world["place"]))
     turn, scale = orthogonal_procrustes(a.numpy(), b.numpy())
     expected = scale / (a.numpy() ** 2).sum() * a.numpy() @ turn
-    found = aligned(a[None], b[None], torch.ones(1, 12, dtype=torch.float64))[0]
+    found = procrustes(a[None], b[None], torch.ones(1, 12, dtype=torch.float64))[0]
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_majorization_never_raises_the_stress(seed: int, reach: float) -> None:
     factor = majorizer(world["weight"], world["trust"], fixed)
     before = stress(y, *parts(world))
     for _ in range(20):
-        y = guttman(y, *parts(world), fixed, factor)
+        y = guttman_step(y, *parts(world), fixed, factor)
         after = stress(y, *parts(world))
         assert (after <= before * (1 + 1e-12)).all()
         before = after
@@ -155,7 +155,7 @@ def test_majorization_ends_in_the_minimum_that_scipy_finds() -> None:
     y, fixed = world["prior"], world["fixed"]
     factor = majorizer(world["weight"], world["trust"], fixed)
     for _ in range(3000):
-        y = guttman(y, *parts(world), fixed, factor)
+        y = guttman_step(y, *parts(world), fixed, factor)
     free = ~fixed[0]
 
     def cost(flat: np.ndarray) -> float:
@@ -168,51 +168,51 @@ def test_majorization_ends_in_the_minimum_that_scipy_finds() -> None:
     np.testing.assert_allclose(y[0, free].ravel(), best.x, atol=1e-2)
 
 
-def test_who_has_no_link_stays_with_its_prior() -> None:
+def test_without_links_a_uav_stays_at_its_prior() -> None:
     world = team(6)
     world["weight"][:, 7] = world["weight"][:, :, 7] = 0.0
     factor = majorizer(world["weight"], world["trust"], world["fixed"])
     y = world["prior"] + 5.0
     for _ in range(3):
-        y = guttman(y, *parts(world), world["fixed"], factor)
+        y = guttman_step(y, *parts(world), world["fixed"], factor)
     assert torch.allclose(y[:, 7], world["prior"][:, 7])
 
 
-# ---------------------------------------------------------------- what errors look like
+# ---------------------------------------------------------------- calibration
 
 
 @pytest.mark.parametrize(("share", "bias", "spread"), [(0.15, 25.0, 10.0), (0.5, 0.0, 50.0)])
 def test_calibration_finds_the_mixture(share: float, bias: float, spread: float) -> None:
     generator = torch.Generator().manual_seed(0)
-    model = calibration.believed_model(1, STD, torch.device("cpu"))
+    model = calibration.prior_model(1, STD, torch.device("cpu"))
     for _ in range(60):
         outlier = torch.rand(1, 400, generator=generator) < share
         normal = torch.randn(1, 400, generator=generator, dtype=torch.float64)
         error = torch.where(outlier, bias + spread * normal, STD * normal)
-        model = calibration.learned(model, error, torch.ones_like(error), 0 * error, STD)
+        model = calibration.em_update(model, error, torch.ones_like(error), 0 * error, STD)
     mean, variance = model.component(STD)
     assert float(model.share[0, 1]) == pytest.approx(share, abs=0.04)
     assert float(mean[0, 1]) == pytest.approx(bias, abs=3.0)
     assert variance[0].sqrt().tolist() == pytest.approx([STD, spread], rel=0.15)
 
 
-def test_nothing_is_learned_from_links_that_were_not_measured() -> None:
-    model = calibration.believed_model(1, STD, torch.device("cpu"))
+def test_links_without_ranges_do_not_calibrate() -> None:
+    model = calibration.prior_model(1, STD, torch.device("cpu"))
     wild = torch.full((1, 50), 500.0, dtype=torch.float64)
-    after = calibration.learned(model, wild, torch.zeros_like(wild), torch.zeros_like(wild), STD)
+    after = calibration.em_update(model, wild, torch.zeros_like(wild), torch.zeros_like(wild), STD)
     assert torch.allclose(after.share, model.share)
 
 
-def test_calibration_takes_off_what_is_unsure_of_the_ends() -> None:
+def test_calibration_separates_the_variance_of_the_ends() -> None:
     generator = torch.Generator().manual_seed(1)
-    unsure = 100.0
-    model = calibration.believed_model(1, STD, torch.device("cpu"))
+    variance_ = 100.0
+    model = calibration.prior_model(1, STD, torch.device("cpu"))
     for _ in range(60):
         outlier = torch.rand(1, 2000, generator=generator) < 0.3
         own = torch.randn(2, 1, 2000, generator=generator, dtype=torch.float64)
-        error = torch.where(outlier, 60.0, 0.0) + STD * own[0] + unsure**0.5 * own[1]
-        added = torch.full_like(error, unsure)
-        model = calibration.learned(model, error, torch.ones_like(error), added, STD)
+        error = torch.where(outlier, 60.0, 0.0) + STD * own[0] + variance_**0.5 * own[1]
+        added = torch.full_like(error, variance_)
+        model = calibration.em_update(model, error, torch.ones_like(error), added, STD)
     mean, variance = model.component(STD)
     assert float(model.share[0, 1]) == pytest.approx(0.3, abs=0.05)
     assert float(mean[0, 1]) == pytest.approx(60.0, abs=4.0)
@@ -240,15 +240,15 @@ def test_information_is_scipys_integral(share: float) -> None:
 
     expected, _ = quad(lambda e: slope(e) ** 2 / density(e), -60, 120, limit=200)
     prior = torch.tensor([[share]], dtype=torch.float64)
-    found = calibration.information(model, prior, STD)
+    found = calibration.fisher_information(model, prior, STD)
     assert float(found) == pytest.approx(expected, rel=0.01)
 
 
-# ---------------------------------------------------------------- links that stay obstructed
+# ---------------------------------------------------------------- persistent NLOS
 
 
 def chain_of_states(rho: float, share: float, steps: int, links: int) -> Tensor:
-    """States [steps, links] of a chain that is drawn anew with probability 1 − ρ."""
+    """States [steps, links] of a chain that is drawn again with probability 1 − ρ."""
     generator = torch.Generator().manual_seed(3)
     state = torch.rand(links, generator=generator) < share
     states = [state]
@@ -265,7 +265,7 @@ def test_links_states_are_those_of_the_brute_force_forward_algorithm() -> None:
     found = torch.tensor([[share]], dtype=torch.float64)
     one = torch.tensor([rho], dtype=torch.float64)
     for each in evidence:
-        found = persistence.forecast(found, one, one.new_tensor([share]))
+        found = persistence.predict(found, one, one.new_tensor([share]))
         found = torch.sigmoid(torch.logit(found) + each)
     weights_of_paths, obstructed = 0.0, 0.0
     for path in itertools.product((0, 1), repeat=steps):
@@ -286,12 +286,12 @@ def test_persistence_is_learned(rho: float) -> None:
     error = torch.where(states, 25.0, 0.0) + noise
     evidence = ((error.square() - (error - 25.0).square()) / (2 * STD**2)).double()
     shares = torch.tensor([share], dtype=torch.float64)
-    counts = persistence.believed_chain(shares)
+    counts = persistence.prior_counts(shares)
     before = torch.full((1, links), share, dtype=torch.float64)
     ones = torch.ones_like(before)
     for each in evidence:
-        counts = persistence.learned(counts, before, each[None], ones, shares)
-        prior = persistence.forecast(before, persistence.persistence(counts), shares)
+        counts = persistence.update(counts, before, each[None], ones, shares)
+        prior = persistence.predict(before, persistence.persistence(counts), shares)
         before = torch.sigmoid(torch.logit(prior) + each)
     assert float(persistence.persistence(counts)) == pytest.approx(rho, abs=0.06)
 
@@ -310,19 +310,19 @@ def test_the_bias_is_filterpys() -> None:
     reference.H, reference.R = np.array(((1.0, 0.0),)), np.array(((other,),))
     reference.B = np.array(((dt,), (0.0,)))
     zero = torch.zeros(1, 1, dtype=torch.float64)
-    state = drift.Drift(zero.unsqueeze(-1), zero, zero + ins.bias**2)
+    state = ins_bias.initial(zero.unsqueeze(-1), ins)
     place, variance = zero.unsqueeze(-1), zero + 100.0
     time = torch.full_like(zero, dt)
     for speed, seen in zip((1.0, -2.0, 0.5, 3.0), (4.0, 1.0, 2.5, 9.0), strict=True):
         reference.predict(u=np.array(((speed,),)))
         reference.update(np.array(((seen,),)))
-        state = drift.aged(state, time, ins)
+        state = ins_bias.decay(state, time, ins)
         before = place + (speed - state.bias) * dt
-        state, factor, new = drift.reckoned(state, variance, time, ins)
+        state, factor, new = ins_bias.predict(state, variance, time, ins)
         was = factor.square() * variance + new
         variance = 1 / (1 / was + 1 / other)
         place = before + (variance / other).unsqueeze(-1) * (seen - before)
-        state = drift.informed(state, place - before, was, variance)
+        state = ins_bias.update(state, place - before, was, variance)
     found = (float(place), float(state.bias))
     np.testing.assert_allclose(found, reference.x.ravel(), rtol=1e-9)
     moments = ((float(variance), float(state.cross)), (float(state.cross), float(state.variance)))
@@ -340,30 +340,33 @@ def test_joint_covariance_is_numpys(e: int) -> None:
     k = 12 * e
     root = torch.randn(2, k, k, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     before = (root @ root.mT + k * torch.eye(k)).unflatten(1, (12, e))
-    kept, added = torch.linspace(0.8, 1.0, 24).double().view(2, 12), 4 * torch.ones(2, 12).double()
-    now = joint.carried(before, kept, added, fixed, 0.25)
-    index = joint.moving(fixed)
-    trust = joint.precision(joint.among(now, index), fixed[:, index])
+    factor, noise = (
+        torch.linspace(0.8, 1.0, 24).double().view(2, 12),
+        4 * torch.ones(2, 12).double(),
+    )
+    now = joint.predict(before, factor, noise, fixed, 0.25)
+    index = joint.free_indices(fixed)
+    trust = joint.precision(joint.submatrix(now, index), fixed[:, index])
     every = torch.arange(12)
 
-    def told_to(index: Tensor) -> Tensor:
+    def information_on(index: Tensor) -> Tensor:
         if e == 1:
             return joint.laplacian(world["weight"] / 3, index)
-        return joint.among(fisher(y, world["weight"]).flatten(3), index).flatten(1, 2)
+        return joint.submatrix(fisher(y, world["weight"]).flatten(3), index).flatten(1, 2)
 
-    told = told_to(index)
-    found = joint.whole(
-        joint.posterior(told + trust, fixed[:, index], variance[:, index]), index, variance
+    links = information_on(index)
+    found = joint.embed(
+        joint.posterior(links + trust, fixed[:, index], variance[:, index]), index, variance
     )
-    each = kept.repeat_interleave(e, -1)[0].numpy()
+    each = factor.repeat_interleave(e, -1)[0].numpy()
     whole = each[:, None] * before.flatten(1, 2)[0].numpy() * each + 4 * np.eye(k)
     free = slice(4 * e, None)
-    links = told_to(every)[0].numpy()[free, free]
-    expected = np.linalg.inv(np.linalg.inv(whole[free, free]) + links)
+    both = information_on(every)[0].numpy()[free, free]
+    expected = np.linalg.inv(np.linalg.inv(whole[free, free]) + both)
     result = found.flatten(1, 2)[0].numpy()
     np.testing.assert_allclose(result[free, free], expected, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(result[: 4 * e, : 4 * e], 0.25 * np.eye(4 * e))
-    apart = joint.between(found)[0, 5, 9]
+    apart = joint.pair_variance(found)[0, 5, 9]
     blocks = result.reshape(12, e, 12, e)
     difference = blocks[5, :, 5] + blocks[9, :, 9] - blocks[5, :, 9] - blocks[9, :, 5]
     assert float(apart) == pytest.approx(np.trace(difference) / e)
@@ -375,7 +378,7 @@ def test_a_link_with_an_outliers_residual_is_shifted_back_and_counts_less() -> N
         batch_size=(1,),
     )
     residual = torch.tensor([[[0.0, 25.0], [12.5, 60.0]]], dtype=torch.float64)
-    weight, shift = calibration.judged(model, residual, torch.zeros_like(residual), STD)
+    weight, shift = calibration.weights_and_shifts(model, residual, torch.zeros_like(residual), STD)
     assert 0.0 < float(shift[0, 0, 0]) < 3.0 < 20.0 < float(shift[0, 0, 1]) < 25.0
     assert torch.allclose(weight, torch.full_like(weight, 1 / STD**2))  # both as wide
     assert (shift.diff(dim=-1) > 0).all()
@@ -388,6 +391,16 @@ def test_huber_weights_are_scipys() -> None:
     assert (weight * STD**2)[0].tolist() == [[1.0, 1.0], [pytest.approx(0.5), 1.0]]
 
 
+def test_the_papers_confidence_is_equation_17() -> None:
+    """clip(1 − 0.5 s − 0.3 ρ, 0.1, 1), s for residuals beyond three standard deviations."""
+    residual = torch.tensor([[[0.0, 31.0], [-31.0, 31.0]]], dtype=torch.float64)
+    packet_loss = torch.tensor([[[0.0, 0.0], [0.5, 1.0]]], dtype=torch.float64)
+    found = weights.paper_confidence(residual, packet_loss, torch.zeros_like(residual), STD)
+    np.testing.assert_allclose(found[0], [[1.0, 0.5], [0.85, 0.2]])
+    wide = weights.paper_confidence(residual, packet_loss, 10.0 + 0 * residual, STD)
+    np.testing.assert_allclose(wide[0], [[1.0, 1.0], [0.85, 0.7]])
+
+
 # ---------------------------------------------------------------- Gauss–Newton
 
 
@@ -398,7 +411,7 @@ def test_gauss_newton_is_scipys_least_squares() -> None:
     found, _, information = gauss_newton(
         world["prior"],
         world["distance"],
-        lambda residual: weights.plain(residual, world["mask"], STD),
+        lambda residual: weights.uniform(residual, world["mask"], STD),
         fixed,
         world["prior"],
         precision,

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.registry import LOCALIZERS, make
-from agents.wrappers.correction import Based, Correction, with_base
+from agents.wrappers.correction import Correction, CorrectionMemory, with_base
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.pettingzoo import parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
@@ -22,7 +23,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
-Step = tuple[dict[str, Tensor], Based, Tensor]
+Step = tuple[dict[str, Tensor], CorrectionMemory, Tensor]
 N, WORLDS = 3, 2
 BASES = (
     *("dead_reckoning", "ekf", "ekf:robust=huber+temporal", "ekf_joint", "ekf_trust:weights=none"),
@@ -265,7 +266,7 @@ def test_without_feedback_the_base_never_knows(base: str) -> None:
 @pytest.mark.parametrize("base", ["ekf:robust=huber+temporal", "apf:particles=60:bounds=40,90"])
 def test_a_reset_of_some_rows_starts_their_base_alone(base: str) -> None:
     scenario = indoor(n_uavs=2, failure_rate=1.0, horizon=9)
-    env, row = with_base(CoLocEnv(scenario, 3), base, 0.5), 1
+    env, row = with_base(CoLocEnv(scenario, 3, seed=0), base, 0.5), 1
     now, kept, ended = env.reset(), [], []
     for _ in range(14):
         now["uav", "action"] = torch.full((3, 2, 3), 0.5)
@@ -317,7 +318,7 @@ def test_every_face_takes_a_base() -> None:
 
 
 class Stateless(Localizer[Observation]):
-    """Says the prior, and shows no state."""
+    """Estimates the prior, and has no state to show."""
 
     name = "test_stateless"
 
@@ -339,12 +340,11 @@ class Immovable(Stateless):
 
 @pytest.fixture
 def _more_bases() -> Iterator[None]:
-    before = dict(LOCALIZERS)
-    register("test_stateless")(Stateless)
-    register("test_immovable")(Immovable)
+    LOCALIZERS.register("test_stateless")(Stateless)
+    LOCALIZERS.register("test_immovable")(Immovable)
     yield
-    LOCALIZERS.clear()
-    LOCALIZERS.update(before)
+    LOCALIZERS.remove("test_stateless")
+    LOCALIZERS.remove("test_immovable")
 
 
 @pytest.mark.parametrize(
@@ -356,9 +356,21 @@ def _more_bases() -> Iterator[None]:
         ("ekf", 1.5, "feedback=1.5 is not allowed: a share in [0, 1]"),
         ("ekf", -0.1, "feedback=-0.1 is not allowed: a share in [0, 1]"),
         ("ekf", float("nan"), "feedback=nan is not allowed: a share in [0, 1]"),
-        ("test_stateless", 0.0, "base='test_stateless' is not allowed: a filter, such as ekf"),
-        ("test_immovable", 0.5, "base='test_immovable' is not allowed: a filter, such as ekf"),
-        ("mappo:weights=none", 0.0, "base='mappo:weights=none' is not allowed: a filter, such as"),
+        (
+            "test_stateless",
+            0.5,
+            "base='test_stateless' with feedback=0.5 is not allowed: it cannot",
+        ),
+        (
+            "test_immovable",
+            0.5,
+            "base='test_immovable' with feedback=0.5 is not allowed: it cannot",
+        ),
+        (
+            "mappo:weights=none",
+            1.0,
+            "base='mappo:weights=none' with feedback=1.0 is not allowed: it",
+        ),
     ],
 )
 @pytest.mark.usefixtures("_more_bases")
@@ -372,8 +384,8 @@ def test_wrong_bases_are_named(base: str, feedback: float, words: str) -> None:
 
 @pytest.mark.usefixtures("_more_bases")
 def test_a_base_that_cannot_be_moved_serves_without_feedback() -> None:
-    env = with_base(CoLocEnv(indoor()), "test_immovable")
-    plain = with_base(CoLocEnv(indoor()), "dead_reckoning")
+    env = with_base(CoLocEnv(indoor(), seed=0), "test_immovable")
+    plain = with_base(CoLocEnv(indoor(), seed=0), "dead_reckoning")
     assert torch.equal(env.rollout(2)["state"][:, 0], plain.rollout(2)["state"][:, 0])
 
 
@@ -388,3 +400,74 @@ def test_a_mode_made_elsewhere_does_not_fit() -> None:
         parallel_env(indoor(), action=mode)
     with pytest.raises(ValueError, match="the action mode was made for another scenario"):
         CoLocEnv(indoor(), action=Displacement(indoor().believed))
+
+
+# ---------------------------------------------------------------- bases without a mean state
+
+BARE = [
+    ("swarm-v0", "map", {"n_uavs": 20, "horizon": 8}),
+    ("swarm-v0", "stdcl", {"n_uavs": 20, "horizon": 8}),
+    ("stein2d-v0", "cspf", {"horizon": 8}),
+    ("indoor-v0", "mappo:weights=none", {"n_uavs": 3, "horizon": 8}),
+]
+
+
+@pytest.mark.parametrize(("name", "base", "settings"), BARE)
+def test_any_localizer_with_an_estimate_serves_as_a_base(
+    name: str, base: str, settings: dict[str, Any]
+) -> None:
+    """What is corrected is the localizer's own run, by 2 σ an axis, of which a hundredth of a large
+    arena is the most."""
+    scenario = make_scenario(name, **settings)
+    d, n = scenario.arena.dim, scenario.arena.n_uavs
+    longest = max(b - a for a, b in zip(scenario.arena.low, scenario.arena.high, strict=True))
+    env = with_base(CoLocEnv(scenario, 2, seed=3), base)
+    localizer, world = make(base, scenario), World(scenario, 2)
+    now, seen = env.reset(), world.reset(3)
+    belief, before = localizer.reset(seen), None
+    for _ in range(4):
+        belief, estimate = localizer.step(belief, seen)
+        action = estimate.action()
+        leaves = now["uav", "observation"]
+        assert not {"attitude", "landmark_fixes", "fix_mean"} & set(leaves.keys())
+        torch.testing.assert_close(leaves["base_estimate"], action)
+        torch.testing.assert_close(leaves["base_std"], action[..., 2 * d :].exp())
+        assert leaves["residuals"].shape[-1] == d
+        if before is not None:
+            ahead = before[..., :d] + scenario.arena.dt * before[..., d : 2 * d]
+            # float32 has steps of 0.0005 m at 5 km
+            torch.testing.assert_close(
+                leaves["residuals"], action[..., :d] - ahead, atol=2e-3, rtol=0
+            )
+        before = action
+        push = torch.linspace(-1, 1, 2 * n * d).view(2, n, d)
+        now["uav", "action"] = push
+        now = env.step(now)["next"]
+        most = max(1.0, longest / 100)
+        scale = (2 * action[..., 2 * d :].exp()).clamp(max=most)
+        moved = torch.cat((action[..., :d] + scale * push, action[..., d:]), -1)
+        step = world.step(moved)
+        torch.testing.assert_close(now["uav", "reward"][..., 0], step.reward)
+        seen = world.observation()
+
+
+@pytest.mark.parametrize(("name", "base", "settings"), BARE)
+def test_bases_without_a_state_serve_every_face_and_restart_by_row(
+    name: str, base: str, settings: dict[str, Any]
+) -> None:
+    scenario = make_scenario(name, **settings)
+    single, rows = with_base(parallel_env(scenario), base), with_base(CoLocVecEnv(scenario), base)
+    observations, _ = single.reset(seed=2)
+    assert single.observation_space("uav_0").contains(observations["uav_0"])
+    flat = rows.reset()
+    assert flat.shape == (scenario.arena.n_uavs, 3 * scenario.arena.dim)
+    assert rows.leaves == ("base_std", "residuals", "last_action")
+    batch = with_base(CoLocEnv(scenario, 2, seed=2), base)
+    now = batch.reset()
+    now["uav", "action"] = torch.zeros_like(batch.action_spec.rand()["uav", "action"])
+    after = batch.step(now)["next"]
+    again = batch._reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    kept, stayed = again["uav", "observation", "base_estimate"], after["uav", "observation"]
+    assert torch.equal(kept[1], stayed["base_estimate"][1])
+    fresh = with_base(CoLocEnv(scenario, 1, seed=4), base).reset()
+    torch.testing.assert_close(kept[0], fresh["uav", "observation", "base_estimate"][0])

@@ -27,15 +27,15 @@ TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.
 
 
 def team(**overrides: Any) -> Scenario:
-    """A swarm, small and, unless told otherwise, fully linked."""
-    chosen: dict[str, Any] = {"n_uavs": 8, "anchors": 0.5, "comm_radius": None, "horizon": 10}
+    """A swarm, small and, unless asked otherwise, fully linked."""
+    chosen: dict[str, Any] = {"n_uavs": 8, "anchor_share": 0.5, "comm_radius": None, "horizon": 10}
     return make_scenario("swarm-v0", **(chosen | overrides))
 
 
 def mse(
     positions: NDArray[np.float64] | tuple,
     links: Links,
-    guides: int,
+    anchors: int,
     std: float = 1.0,
     fix_std: float = 1e-5,
 ) -> NDArray[np.float64]:
@@ -48,13 +48,13 @@ def mse(
     seen = Observation(
         {
             "range_mask": reach,
-            "position_fix_mask": (torch.arange(n) < guides).float().view(1, n, 1),
+            "position_fix_mask": (torch.arange(n) < anchors).float().view(1, n, 1),
         }
     )
     attitude = torch.zeros(1, n, 4 if dim == 3 else 1, dtype=torch.float64)
     attitude[..., 0] = float(dim == 3)
     truth = Kinematics(place, torch.zeros_like(place), attitude)
-    sensors: list[Sensor] = [PositionFix(fix_std, max(guides, 1)), Ranging(RangeNoise(std))]
+    sensors: list[Sensor] = [PositionFix(fix_std, max(anchors, 1)), Ranging(RangeNoise(std))]
     pose = torch.eye(6 if dim == 3 else 3, dim, dtype=torch.float64)
     return position_mse(sensors, truth, seen, pose)[0].numpy()
 
@@ -146,7 +146,7 @@ def test_bound_is_the_inverse_of_the_expected_hessian(kind: str) -> None:
     def expected(p: Tensor) -> Tensor:
         shift = (distances(at) - distances(p)).unsqueeze(1)
         ranges = -(weights * log_density(errors + shift)).sum()
-        fixes = 0.5 * ((p - at)[: task.guides] / 0.1).square().sum()
+        fixes = 0.5 * ((p - at)[: task.anchor_uavs] / 0.1).square().sum()
         return ranges + fixes
 
     hessian = torch.autograd.functional.hessian(expected, at).reshape(21, 21)
@@ -179,15 +179,15 @@ def test_what_earlier_steps_would_tell_is_not_known() -> None:
 # ---------------------------------------------------------------- who is localizable
 
 
-def by_ranks(positions: NDArray[np.float64], links: Links, guides: int) -> NDArray[np.bool_]:
+def by_ranks(positions: NDArray[np.float64], links: Links, anchors: int) -> NDArray[np.bool_]:
     """Whether any motion of the UAVs of a connected part, anchors held, that keeps all its ranges
     to first order moves each UAV: the null space of the rigidity matrix."""
     n, d = positions.shape
-    found = np.arange(n) < guides
+    found = np.arange(n) < anchors
     graph = networkx.Graph(links)
     graph.add_nodes_from(range(n))
-    graph.remove_edges_from([(i, j) for i, j in links if i < guides and j < guides])
-    free = graph.subgraph(range(guides, n))
+    graph.remove_edges_from([(i, j) for i, j in links if i < anchors and j < anchors])
+    free = graph.subgraph(range(anchors, n))
     for part in networkx.connected_components(free):
         order = {uav: k for k, uav in enumerate(sorted(part))}
         edges = [(i, j) for i, j in graph.edges if i in order or j in order]
@@ -209,16 +209,16 @@ def test_localizable_are_those_that_no_free_motion_moves(dim: int) -> None:
     rng = np.random.default_rng(dim)
     shares = []
     for trial in range(60):
-        n, guides = int(rng.integers(6, 25)), int(rng.integers(1, 6))
+        n, anchors = int(rng.integers(6, 25)), int(rng.integers(1, 6))
         positions = rng.uniform(0, 100, (n, dim))
         linked = rng.random((n, n)) < rng.uniform(0.1, 0.6)
         links = [(i, j) for i in range(n) for j in range(i) if linked[i, j]]
         found, wanted = (
-            np.isfinite(mse(positions, links, guides)),
-            by_ranks(positions, links, guides),
+            np.isfinite(mse(positions, links, anchors)),
+            by_ranks(positions, links, anchors),
         )
         assert (found == wanted).all(), trial
-        shares.append(wanted[guides:].mean())
+        shares.append(wanted[anchors:].mean())
     assert 5 < sum(0 < share < 1 for share in shares) < 55
 
 
@@ -276,14 +276,14 @@ def test_a_broken_swarm_is_no_trouble() -> None:
     bound = snapshot_bound(task, 3)
     assert bound.mse.shape == bound.localizable.shape == (3, 20, 40)
     assert not bound.mse.isnan().any()
-    assert not bound.scored[..., : task.guides].any()
+    assert not bound.scored[..., : task.anchor_uavs].any()
     assert 0 < bound.share_localizable < 1
     assert bound.rmse == torch.inf
     assert 3.0 < bound.rmse_localizable < torch.inf
     unlinked = snapshot_bound(make_scenario("swarm-v0", n_uavs=5, comm_radius=1.0), 1, steps=1)
     assert unlinked.share_localizable == 0.0
     assert math.isnan(unlinked.rmse_localizable)
-    nobody = snapshot_bound(team(anchors=0.0), 1, steps=1)
+    nobody = snapshot_bound(team(anchor_share=0.0), 1, steps=1)
     assert nobody.share_localizable == 0.0
 
 
@@ -310,29 +310,29 @@ def test_more_knowledge_lowers_the_bound(better: dict, worse: dict) -> None:
 def efficiency(task: Scenario, runs: int, fit: Any) -> float:
     """Mean squared bound over mean squared error, over worlds of their own."""
     world = World(task, runs)
-    seen, guides = world.reset(torch.arange(runs)), task.guides
+    seen, anchors = world.reset(torch.arange(runs)), task.anchor_uavs
     place, ranges = world.truth.position.numpy(), seen["ranges"].double().numpy()
     i, j = np.triu_indices(task.arena.n_uavs, 1)
-    free = j >= guides
+    free = j >= anchors
     i, j = i[free], j[free]
     bound = snapshot_bound(task, runs, steps=1)
     squared = 0.0
-    for true, told in zip(place, ranges, strict=True):
+    for true, measured in zip(place, ranges, strict=True):
 
-        def residual(x: NDArray[np.float64], true: Any = true, told: Any = told) -> Any:
+        def residual(x: NDArray[np.float64], true: Any = true, measured: Any = measured) -> Any:
             p = np.concatenate((true[:guides], x.reshape(-1, 3)))
-            return np.linalg.norm(p[i] - p[j], axis=-1) - told[i, j]
+            return np.linalg.norm(p[i] - p[j], axis=-1) - measured[i, j]
 
         def jacobian(x: NDArray[np.float64], true: Any = true) -> Any:
-            p = np.concatenate((true[:guides], x.reshape(-1, 3)))
+            p = np.concatenate((true[:anchors], x.reshape(-1, 3)))
             along = (p[i] - p[j]) / np.linalg.norm(p[i] - p[j], axis=-1)[:, None]
             matrix, row = np.zeros((len(i), len(p), 3)), np.arange(len(i))
             matrix[row, i], matrix[row, j] = along, -along
-            return matrix[:, guides:].reshape(len(i), -1)
+            return matrix[:, anchors:].reshape(len(i), -1)
 
-        found = fit(residual, jacobian, true[guides:].ravel())
-        squared += float(((found - true[guides:].ravel()) ** 2).sum())
-    return float(bound.mse[:, 0, guides:].sum()) / squared
+        found = fit(residual, jacobian, true[anchors:].ravel())
+        squared += float(((found - true[anchors:].ravel()) ** 2).sum())
+    return float(bound.mse[:, 0, anchors:].sum()) / squared
 
 
 def test_maximum_likelihood_attains_the_bound_under_gaussian_noise() -> None:
@@ -345,7 +345,7 @@ def test_maximum_likelihood_attains_the_bound_under_gaussian_noise() -> None:
 
 
 def test_maximum_likelihood_comes_near_the_bound_under_nlos() -> None:
-    """It needs many ranges per UAV to tell which are NLOS; from the truth on, as a bound that is
+    """It needs many ranges per UAV to know which are NLOS; from the truth on, as a bound that is
     local wants."""
 
     def fit(residual: Any, jacobian: Any, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -359,7 +359,7 @@ def test_maximum_likelihood_comes_near_the_bound_under_nlos() -> None:
 
         return np.asarray(minimize(loss, start, jac=True, method="BFGS", tol=1e-4).x)
 
-    found = efficiency(team(n_uavs=40, anchors=0.8, anchor_std=0.0), 80, fit)
+    found = efficiency(team(n_uavs=40, anchor_share=0.8, anchor_std=0.0), 80, fit)
     assert 0.9 < found < 1.06
 
 

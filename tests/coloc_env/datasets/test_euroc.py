@@ -1,12 +1,15 @@
 """EuRoC files in miniature: frames, teams, and what is refused."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coloc_env.datasets import DataError, load_euroc
+from coloc_env.datasets import DataError, Recording, load, load_euroc
 
 IMU = "#t,w,w,w,a,a,a\n1403715273262142976,1,2,3,9,0.5,-3\n1403715273267142912,1,2,3,9,0.5,-3\n"
 POSE = "0.8,2.1,0.9,0.5,-0.5,0.1,-0.7,1,2,3,0.1,0.2,0.3,0.4,0.5,0.6"
@@ -22,9 +25,9 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(folder: Path, imu: str = IMU, truth: str = TRUTH) -> Path:
-    folder.mkdir()
-    (folder / "imu0.csv").write_text(imu)
-    (folder / "groundtruth.csv").write_text(truth)
+    folder.mkdir(parents=True)
+    (folder / "imu0.csv").write_text(imu, encoding="utf-8")
+    (folder / "groundtruth.csv").write_text(truth, encoding="utf-8")
     return folder
 
 
@@ -97,3 +100,26 @@ def test_missing_file(tmp_path: Path) -> None:
     (folder / "imu0.csv").unlink()
     with pytest.raises(DataError, match=r"imu0\.csv: no such file"):
         load_euroc(folder)
+
+
+def test_a_missing_truth_is_no_smaller_team(tmp_path: Path) -> None:
+    folders = [write(tmp_path / "euroc" / name) for name in ("V1_01_easy", "V1_02_medium")]
+    assert load("euroc", data=tmp_path).robots == ("V1_01_easy", "V1_02_medium")
+    (folders[1] / "groundtruth.csv").unlink()
+    with pytest.raises(DataError, match=r"V1_02_medium/groundtruth\.csv: no such file"):
+        load("euroc", data=tmp_path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data())
+def test_any_damage_is_read_or_a_data_error(
+    tmp_path_factory: pytest.TempPathFactory,
+    survives: Callable[[Callable[[], Recording]], None],
+    damaged: Callable[[st.DataObject, str], str],
+    data: st.DataObject,
+) -> None:
+    files = {"imu": IMU, "truth": TRUTH}
+    name = data.draw(st.sampled_from(sorted(files)))
+    files[name] = damaged(data, files[name])
+    folder = write(tmp_path_factory.mktemp("damaged") / "V1_01_easy", **files)
+    survives(lambda: load_euroc(folder))

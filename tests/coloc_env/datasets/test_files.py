@@ -1,6 +1,7 @@
 """Reading text files: exact times, errors that name the line, the cache."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coloc_env.datasets import files
+from coloc_env.datasets import files, folders
 from coloc_env.datasets.files import DataError, FileFormat, distinct, fail, read
 
 SECONDS = FileFormat(("x", "n"), "seconds", whole=("n",))
@@ -55,6 +56,84 @@ def test_good_file(tmp_path: Path, form: FileFormat, time: list[int]) -> None:
     assert rows.values.tolist() == [[2.5, 7.0], [-1e-3, 8.0], [1.0, 9.0]]
 
 
+STRANGE: dict[str, Callable[[bytes], bytes]] = {
+    "mark of byte order": lambda text: b"\xef\xbb\xbf" + text,
+    "DOS lines": lambda text: text.replace(b"\n", b"\r\n"),
+    "blank last line": lambda text: text + b"\n",
+    "blank last lines": lambda text: text + b"\r\n\r\n",
+    "no last line end": lambda text: text.rstrip(),
+}
+
+
+@pytest.mark.parametrize("form", GOOD)
+@pytest.mark.parametrize("strange", STRANGE)
+def test_strangers_files(tmp_path: Path, form: FileFormat, strange: str) -> None:
+    path = write(tmp_path, GOOD[form])
+    expected = read(path, form)
+    path.write_bytes(STRANGE[strange](GOOD[form].encode()))
+    found = read(path, form)
+    np.testing.assert_array_equal(found.time, expected.time)
+    np.testing.assert_array_equal(found.values, expected.values)
+
+
+@pytest.mark.parametrize(
+    ("form", "old", "new"),
+    [(SECONDS, "# t x n", "# 20 \xb0C"), (NAMED, "a, b", "20 \xb0C"), (MARKED, "a or b", "\xb0C")],
+)
+def test_a_latin_1_byte_where_nothing_is_read(
+    tmp_path: Path, form: FileFormat, old: str, new: str
+) -> None:
+    path = tmp_path / "latin.txt"
+    path.write_bytes(GOOD[form].replace(old, new).encode("latin-1"))
+    assert read(path, form).values.tolist() == [[2.5, 7.0], [-1e-3, 8.0], [1.0, 9.0]]
+
+
+@pytest.mark.parametrize(
+    ("form", "stamp", "nanoseconds"),
+    [
+        (SECONDS, "1248444175.1031234567", 1248444175103123457),
+        (SECONDS, "1248444175.10312345650000", 1248444175103123456),
+        (SECONDS, "1.248444175103e+09", 1248444175103000000),
+        (SECONDS, "1.25E9", 1250000000000000000),
+        (SECONDS, "001248444175.1", 1248444175100000000),
+        (NANOSECONDS, "1.248444175103E+18", 1248444175103000000),
+        (NANOSECONDS, "1248444175103000000.000", 1248444175103000000),
+    ],
+)
+def test_stamps_as_strangers_write_them(
+    tmp_path: Path, form: FileFormat, stamp: str, nanoseconds: int
+) -> None:
+    sign = form.delimiter or " "
+    assert read(write(tmp_path, sign.join((stamp, "1", "1"))), form).time.tolist() == [nanoseconds]
+
+
+@pytest.mark.parametrize("value", ["1e308", "-2e9"])
+def test_what_is_beyond_all_measure(tmp_path: Path, value: str) -> None:
+    path = write(tmp_path, GOOD[SECONDS].replace("-1e-3", value))
+    with pytest.raises(DataError, match=r"line 4: x is .*, beyond 1e\+09"):
+        read(path, SECONDS)
+
+
+def test_natural_order_without_hidden_files(tmp_path: Path) -> None:
+    for name in ("r12.csv", "r2.csv", "r01.csv", ".DS_Store", "._r2.csv", "a10b2.csv", "a10b1.csv"):
+        (tmp_path / name).touch()
+    names = [path.name for path in folders.entries(tmp_path)]
+    assert names == ["a10b1.csv", "a10b2.csv", "r01.csv", "r2.csv", "r12.csv"]
+
+
+def test_no_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless(_: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    monkeypatch.delenv("COLOC_CACHE")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    assert len(read(write(tmp_path, GOOD[SECONDS]), SECONDS).time) == 3
+    monkeypatch.setenv("COLOC_DATA", "~/recordings")
+    with pytest.raises(DataError, match="no home folder is known"):
+        folders.data_root()
+
+
 def test_windows_line_ends_and_no_last_one(tmp_path: Path) -> None:
     path = tmp_path / "dos.txt"
     path.write_bytes(GOOD[SECONDS].rstrip().replace("\n", "\r\n").encode())
@@ -85,9 +164,16 @@ def test_times_are_exact(tmp_path_factory: pytest.TempPathFactory, stamps: list[
         (SECONDS, "-1e-3", "1e999", "line 4: x is not a finite number"),
         (SECONDS, "8\n", "8.5\n", "line 4: n is 8.5, not a whole number"),
         (SECONDS, "175.115", "175.102", "line 4: the time is before that of the line above"),
-        (SECONDS, "1248444175.115", "1.25e9", "line 4: the time is 1.25e9, not seconds since 1970"),
+        (SECONDS, "1248444175.115", "1.25e+12", "line 4: the time is 1.25e+12, not seconds"),
         (SECONDS, "1248444175.115", "nan", "line 4: the time is nan, not seconds since 1970"),
-        (SECONDS, ".115", ".1150000001", "line 4: the time is 1248444175.1150000001, not"),
+        (SECONDS, ".115", ".115" + 48 * "0", "line 4: the time is 1248444175.115000"),
+        (SECONDS, "1248444175.115", "1e999999999", "line 4: the time is 1e999999999, not seconds"),
+        (
+            SECONDS,
+            "1248444175.115",
+            "1248444175.1e+0x",
+            "line 4: the time is 1248444175.1e+0x, not",
+        ),
         (SECONDS, "1248444175.115", "-1.5", "line 4: the time is -1.5, not seconds since 1970"),
         (SECONDS, "1248444175.115", "99999999999.5", "line 4: the time is 99999999999.5, not"),
         (NANOSECONDS, "977,-1", ".5,-1", "line 3: the time is 1403715273262142.5, not nanosec"),
@@ -103,7 +189,7 @@ def test_times_are_exact(tmp_path_factory: pytest.TempPathFactory, stamps: list[
         (NAMED, "9,c", "nine,c", "line 5: n is 'nine', not a number"),
         (NAMED, "9,c", '9,"c', "line 5: 2 columns, not 4"),
         (STAMPED, "at,", "when,", "line 1: the header does not name one column 'at'"),
-        (STAMPED, "426e+18", "426e+17", "line 3: the time is 1.4037152732621426e+17, not nanosec"),
+        (STAMPED, "426e+18", "426e+17", "line 3: the time is before that of the line above"),
         (STAMPED, "426e+18", "426e+185", "line 3: the time is 1.4037152732621426e+185, not"),
         (STAMPED, "1.4037", "14.037", "line 3: the time is 14.037152732621426e+18, not nanosec"),
         (STAMPED, "1.4037152732621426e", "1.4037152732621426123e", "line 3: the time is 1.403715"),
@@ -208,9 +294,12 @@ def test_cache_that_cannot_be_written_is_no_error(
 
 def test_data_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLOC_DATA", str(tmp_path))
-    assert files.data_root() == tmp_path
-    assert files.data_root(tmp_path.parent) == tmp_path.parent
-    for call in (lambda: files.data_root(tmp_path / "away"), lambda: files.dataset_folder("euroc")):
+    assert folders.data_root() == tmp_path
+    assert folders.data_root(tmp_path.parent) == tmp_path.parent
+    for call in (
+        lambda: folders.data_root(tmp_path / "away"),
+        lambda: folders.dataset_folder("euroc"),
+    ):
         with pytest.raises(DataError, match=r"COLOC_DATA or --data.* \(from http") as caught:
             call()
         assert str(tmp_path) in str(caught.value)
@@ -220,10 +309,10 @@ def test_data_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_data_root_without_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("COLOC_DATA", raising=False)
     module = tmp_path / "checkout" / "coloc_env" / "datasets" / "files.py"
-    monkeypatch.setattr(files, "__file__", str(module))
+    monkeypatch.setattr(folders, "__file__", str(module))
     with pytest.raises(DataError, match="no folder of recordings is known"):
-        files.data_root()
+        folders.data_root()
     module.parent.mkdir(parents=True)
     (tmp_path / "checkout" / "pyproject.toml").touch()
     (tmp_path / "shared" / "data").mkdir(parents=True)
-    assert files.data_root() == tmp_path / "shared" / "data"
+    assert folders.data_root() == tmp_path / "shared" / "data"

@@ -1,6 +1,6 @@
 """Hanyang files in miniature: exact times, horizontal distances, and what is refused."""
 
-import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coloc_env.datasets import DataError, load_hanyang
+from coloc_env.datasets import DataError, Recording, load_hanyang
 
 HEADER = "%time,field.stamp,field.id,field.x,field.y,field.z,field.distanceFromTag,field.rssi,"
 HEADER += "field.rssi_fp\n"
@@ -59,11 +59,29 @@ def test_ranges_are_made_horizontal(tmp_path: Path) -> None:
     np.testing.assert_allclose(ranges.values[:, 2], [0.6, (6.05**2 - 0.36) ** 0.5, 1.5])
 
 
+@pytest.mark.parametrize("value", ["", "-1", "0", "nan", "inf", "1e308", "301"])
+def test_what_is_no_range_is_left_out_and_counted(tmp_path: Path, value: str) -> None:
+    changed = FILES["A3.csv"].replace(",1.7,", f",{value},")
+    recording = load_hanyang(write(tmp_path / "x", A3=changed))
+    assert recording.dropped == {"anchor_ranges": 1}
+    assert len(recording.streams["anchor_ranges"][0].time) == 2
+
+
+def test_anchors_with_leading_zeros_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    folder = write(tmp_path / "x")
+    (folder / "A3.csv").rename(folder / "A03.csv")
+    (folder / "._A12.csv").write_bytes(b"\x00\x05")
+    assert load_hanyang(folder).anchors.tolist() == [[2.5, 0.87], [0.69, 0.87]]
+    (folder / "A3.csv").write_bytes((folder / "A03.csv").read_bytes())
+    with pytest.raises(DataError, match=r"the anchor of A0?3\.csv again"):
+        load_hanyang(folder)
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "reason"),
     [
         ("A12", ",12,", ",3,", "line 2: field.id is 3, not 12"),
-        ("A12", "6.05", "", "line 2: field.distanceFromTag is '', not a number"),
+        ("A12", "6.05", "far", "line 2: field.distanceFromTag is 'far', not a number"),
         ("A12", "field.z", "z", "line 1: the header does not name one column 'field.z'"),
         ("A3", "0.87,1.9,1.7", "0.88,1.9,1.7", "line 4: the anchor is in another place"),
         ("A3", "1734501485416840553", "1734501485116840553", "line 3: the time is before"),
@@ -93,17 +111,16 @@ def test_missing_files(tmp_path: Path) -> None:
         load_hanyang(folder)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_any_damage_is_read_or_a_data_error(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory,
+    survives: Callable[[Callable[[], Recording]], None],
+    damaged: Callable[[st.DataObject, str], str],
+    data: st.DataObject,
 ) -> None:
     name = data.draw(st.sampled_from(sorted(FILES)))
     content = FILES[name]
-    start = data.draw(st.integers(0, len(content)))
-    end = data.draw(st.integers(start, min(start + 8, len(content))))
-    text = data.draw(st.text("0123456789.-+e# \n\t\"',;nax", max_size=4))
-    changed = content[:start] + text + content[end:]
+    changed = damaged(data, content)
     folder = write(tmp_path_factory.mktemp("damaged"), **{name.removesuffix(".csv"): changed})
-    with contextlib.suppress(DataError):
-        load_hanyang(folder)
+    survives(lambda: load_hanyang(folder))

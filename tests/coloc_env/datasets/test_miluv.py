@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from coloc_env.datasets import DataError, load_miluv
+from coloc_env.datasets import DataError, Recording, load_miluv
 
 EXPERIMENT = "flight_2_random_0b"
 CONFIG = {
@@ -57,7 +59,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Writer:
             if content is not None:
                 path = tmp_path / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(content)
+                path.write_text(content, encoding="utf-8")
         return tmp_path / EXPERIMENT
 
     return writer
@@ -151,7 +153,7 @@ TAGS, ANCHORS = "config/uwb/tags.yaml", "config/uwb/anchors.yaml"
         ("config/experiments.csv", "anchor_constellation", "x", "no entry 'anchor_constellation'"),
         (ANCHORS, '"0b"', '"1"', "anchors.yaml: not a MILUV configuration: no entry '0b'"),
         (ANCHORS, "[3.0, 0.0, 1.0]", "[3.0, 0.0]", "anchors.yaml: not a MILUV configuration"),
-        (ANCHORS, "[3.0, 0.0, 1.0]", "[3.0, 0.0, .nan]", "'0b' does not hold vectors of three"),
+        (ANCHORS, "[3.0, 0.0, 1.0]", "[3.0, 0.0, .nan]", "0b: (3, 0, nan) is no place"),
         (TAGS, "ifo002:", "ifo003:", "tags.yaml: not a MILUV configuration: no entry 'ifo002'"),
         (TAGS, '"20"', '"twenty"', "tags.yaml: not a MILUV configuration: invalid literal"),
         (TAGS, "ifo002:", "ifo002: {", "tags.yaml: not a MILUV configuration"),
@@ -201,3 +203,51 @@ def test_config_elsewhere(write: Writer, tmp_path: Path) -> None:
 def test_unknown_option(write: Writer, option: dict[str, str]) -> None:
     with pytest.raises(ValueError, match="not one of"):
         load_miluv(write(), **option)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", ["", "-1", "0", "nan", "inf", "1e308", "301"])
+def test_what_is_no_range_is_left_out_and_counted(write: Writer, value: str) -> None:
+    ranges, height = (f"{EXPERIMENT}/ifo001/{name}" for name in ("uwb_range.csv", "height.csv"))
+    changes = {
+        ranges: FILES[ranges].replace("1.5,11,10", f"{value},11,10"),
+        height: FILES[height].replace("1.25", value),
+    }
+    recording = load_miluv(write(changes))
+    assert recording.dropped == {"uav_ranges": 0, "anchor_ranges": 1, "height": 1}
+    assert [len(table.time) for table in recording.streams["anchor_ranges"]] == [0, 1]
+    assert [len(table.time) for table in recording.streams["height"]] == [0, 1]
+
+
+def test_a_missing_robot(write: Writer) -> None:
+    folder = write()
+    (folder / "ifo002" / "mocap.csv").unlink()
+    with pytest.raises(DataError, match=r"ifo002/mocap\.csv: no such file"):
+        load_miluv(folder)
+    for path in (folder / "ifo002").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match=r"experiments\.csv: .* has 2 robots, found are ifo001"):
+        load_miluv(folder)
+
+
+def test_a_robot_without_ranges(write: Writer) -> None:
+    recording = load_miluv(write({f"{EXPERIMENT}/ifo002/uwb_range.csv": UWB}))
+    assert [len(table.time) for table in recording.streams["anchor_ranges"]] == [1, 0]
+
+
+def test_a_configuration_that_nests_without_end(write: Writer) -> None:
+    deep = "ifo001: " + 5000 * "[" + 5000 * "]"
+    with pytest.raises(DataError, match=r"bias\.yaml: not a MILUV configuration"):
+        load_miluv(write({"config/height/bias.yaml": deep}))
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_any_damage_is_read_or_a_data_error(
+    write: Writer,
+    survives: Callable[[Callable[[], Recording]], None],
+    damaged: Callable[[st.DataObject, str], str],
+    data: st.DataObject,
+) -> None:
+    name = data.draw(st.sampled_from(sorted(FILES)))
+    folder = write({name: damaged(data, FILES[name])})
+    survives(lambda: load_miluv(folder))

@@ -1,6 +1,6 @@
 """MRCLAM files in miniature: what is read, what is dropped, what is refused."""
 
-import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coloc_env.datasets import DataError, load_mrclam
+from coloc_env.datasets import DataError, Recording, load_mrclam
+from coloc_env.datasets.grid import common_grid
+from coloc_env.datasets.replay import recorded_bearings
+from coloc_env.sensors import LandmarkBearings
 
 FILES = {
-    "Barcodes.dat": "# Subject # Barcode #\n 1 5\n 3 14\n 6 63\n 7 81\n 9 99\n",
+    "Barcodes.dat": "# Subject # Barcode #\n 1 5\n 3 14\n 6 63\n 7 81\n",
     "Landmark_Groundtruth.dat": "# Subject x y\n 7 2.0 3.0 0.1 0.1\n 6 0.5 -4.0 0.1 0.1\n",
     "Robot1_Groundtruth.dat": "# Time x y heading\n100.100 1.0 2.0 3.1\n100.200 1.1 2.0 -3.1\n"
     "100.200 9.0 9.0 0.0\n100.300 1.2 2.0 -3.0\n",
@@ -70,9 +73,10 @@ def test_sightings_are_sorted_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "old", "new", "reason"),
     [
-        ("Barcodes", "9 99", "9 81", "line 6: barcode 81 stands there twice"),
-        ("Barcodes", "9 99", "3 99", "line 6: subject 3 stands there twice"),
-        ("Barcodes", "9 99", "9 99.5", "line 6: barcode is 99.5, not a whole number"),
+        ("Barcodes", "7 81", "7 63", "line 5: barcode 63 stands there twice"),
+        ("Barcodes", "7 81", "3 81", "line 5: subject 3 stands there twice"),
+        ("Barcodes", "7 81", "7 81.5", "line 5: barcode is 81.5, not a whole number"),
+        ("Barcodes", "7 81", "7 81\n 9 99", "line 6: subject 9 is no landmark, and has no files"),
         ("Landmark_Groundtruth", "0.5 -4.0 0.1 0.1", "0.5 -4.0", "line 3: 3 columns, not 5"),
         ("Robot1_Measurement", "63 2.5 0.2", "63 2.5", "line 3: 3 columns, not 4"),
         ("Robot1_Measurement", "63 2.5", "63 two", "line 3: range is 'two', not a number"),
@@ -100,11 +104,46 @@ def test_foreign_file(tmp_path: Path) -> None:
 def test_missing_file(tmp_path: Path, name: str) -> None:
     folder = write(tmp_path / "x")
     (folder / name).unlink()
-    if name.endswith("_Groundtruth.dat") and name.startswith("Robot"):
-        assert len(load_mrclam(folder).robots) == 1
-        return
     with pytest.raises(DataError, match=f"{name}: no such file"):
         load_mrclam(folder)
+
+
+def test_a_robot_without_any_file(tmp_path: Path) -> None:
+    folder = write(tmp_path / "x")
+    for path in folder.glob("Robot3_*"):
+        path.unlink()
+    with pytest.raises(DataError, match="line 3: subject 3 is no landmark, and has"):
+        load_mrclam(folder)
+
+
+def test_a_robot_without_sightings(tmp_path: Path) -> None:
+    changed = "100.000 1.0 2.0 0.0\n100.300 1.0 2.0 0.0\n"
+    files = {"Robot3_Measurement": "# Time barcode\n", "Robot3_Groundtruth": changed}
+    recording = load_mrclam(write(tmp_path / "x", **files))
+    for stream in ("landmark_bearings", "uav_bearings"):
+        assert recording.streams[stream][1].values.shape == (0, 3)
+    grid = common_grid(recording, 0.1, ())
+    seen, depth = recorded_bearings(recording, grid, LandmarkBearings(2))
+    assert depth == 1
+    assert seen.series["landmark_bearing_mask"].values[:, 1].sum() == 0
+
+
+@pytest.mark.parametrize("value", ["-1", "0", "nan", "inf", "-inf", "1e308", "1e400", "20.5"])
+def test_what_is_no_range_is_left_out_and_counted(tmp_path: Path, value: str) -> None:
+    changed = FILES["Robot1_Measurement.dat"].replace("63 2.5", f"63 {value}")
+    recording = load_mrclam(write(tmp_path / "x", Robot1_Measurement=changed))
+    assert recording.dropped == {"landmark_bearings": 1, "uav_bearings": 0}
+    assert recording.streams["landmark_bearings"][0].values[:, 1].tolist() == [1.5, 1.5]
+
+
+def test_order_is_that_of_numbers_and_hidden_files_are_none(tmp_path: Path) -> None:
+    folder = write(tmp_path / "x", Barcodes=FILES["Barcodes.dat"].replace(" 3 14", " 12 14"))
+    for path in list(folder.glob("Robot3_*")):
+        path.rename(folder / path.name.replace("Robot3", "Robot12"))
+    for path in list(folder.iterdir()):
+        (folder / f"._{path.name}").write_bytes(b"\x00\x05\x16\x07")
+    (folder / ".DS_Store").write_bytes(b"\x00")
+    assert load_mrclam(folder).robots == ("Robot1", "Robot12")
 
 
 def test_no_dataset(tmp_path: Path) -> None:
@@ -112,17 +151,16 @@ def test_no_dataset(tmp_path: Path) -> None:
         load_mrclam(tmp_path / "away")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_any_damage_is_read_or_a_data_error(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory,
+    survives: Callable[[Callable[[], Recording]], None],
+    damaged: Callable[[st.DataObject, str], str],
+    data: st.DataObject,
 ) -> None:
     name = data.draw(st.sampled_from(sorted(FILES)))
     content = FILES[name]
-    start = data.draw(st.integers(0, len(content)))
-    end = data.draw(st.integers(start, min(start + 8, len(content))))
-    text = data.draw(st.text("0123456789.-+e# \n\t\"',;nax", max_size=4))
-    changed = content[:start] + text + content[end:]
+    changed = damaged(data, content)
     folder = write(tmp_path_factory.mktemp("damaged"), **{name.removesuffix(".dat"): changed})
-    with contextlib.suppress(DataError):
-        load_mrclam(folder)
+    survives(lambda: load_mrclam(folder))

@@ -138,20 +138,20 @@ def test_mrclam_sightings(mrclam: Recording, stream: str, robot: int) -> None:
 
 @pytest.mark.parametrize("robot", range(5))
 def test_mrclam_odometry(mrclam: Recording, robot: int) -> None:
-    """What the wheels were told (held between samples) against what the robot did, each second."""
+    """The wheels' commands (held between samples) against what the robot did, each second."""
     table, track = mrclam.streams["odometry"][robot], mrclam.truth[robot]
     held = table.values[:-1] * np.diff(table.time)[:, None] / SECOND
     total = np.concatenate((np.zeros((1, 2)), np.cumsum(held, axis=0)))
     when = np.arange(max(track.time[0], table.time[0]), track.time[-1] - 2 * SECOND, SECOND)
-    told = at(table.time, total, when + SECOND) - at(table.time, total, when)
+    reckoned = at(table.time, total, when + SECOND) - at(table.time, total, when)
     start, end = (at(track.time, track.position, when + shift) for shift in (0, SECOND))
     headings = [at(track.time, track.attitude, when + shift)[:, 0] for shift in (0, SECOND)]
     middle = np.mean(headings, axis=0)
     done = np.sum((end - start) * np.stack((np.cos(middle), np.sin(middle)), -1), axis=1)
     turned = headings[1] - headings[0]
-    for said, did, limit in ((told[:, 0], done, 0.03), (told[:, 1], turned, 0.1)):
-        assert 0.85 < said @ did / (said @ said) < 1.0
-        assert np.std(did - said) < limit
+    for commanded, did, limit in ((reckoned[:, 0], done, 0.03), (reckoned[:, 1], turned, 0.1)):
+        assert 0.85 < commanded @ did / (commanded @ commanded) < 1.0
+        assert np.std(did - commanded) < limit
 
 
 def test_euroc_rates(euroc: Recording) -> None:
@@ -334,7 +334,7 @@ def tuc() -> Recording:
 
 
 def test_tuc_against_its_files(tuc: Recording) -> None:
-    """Read anew: 233 lines of each kind, at the same stamps."""
+    """Read again: 233 lines of each kind, at the same stamps."""
     folder = data_root() / "tuc_indoor_uwb"
     lines = [line.split() for line in (folder / "Indoor_UWB_Input.txt").read_text().splitlines()]
     truth = [line.split() for line in (folder / "Indoor_UWB_GT.txt").read_text().splitlines()]
@@ -370,11 +370,11 @@ def test_tuc_odometry(tuc: Recording) -> None:
     step = np.diff(table.time) / SECOND
     heading = np.append(0.0, np.cumsum(table.values[:-1, 1] * step))
     way = table.values[:-1, 0] * step * np.exp(0.5j * (heading[1:] + heading[:-1]))
-    told = np.append(0.0, np.cumsum(way))
+    reckoned = np.append(0.0, np.cumsum(way))
     true = track.position[:, 0] + 1j * track.position[:, 1]
-    told, true = told - told.mean(), true - true.mean()
-    turn = np.vdot(told, true)
-    assert np.sqrt(np.mean(np.abs(true - told * turn / abs(turn)) ** 2)) < 0.08
+    reckoned, true = reckoned - reckoned.mean(), true - true.mean()
+    turn = np.vdot(reckoned, true)
+    assert np.sqrt(np.mean(np.abs(true - reckoned * turn / abs(turn)) ** 2)) < 0.08
     assert abs(np.rad2deg(np.angle(-turn))) < 20
     assert np.sum(np.abs(way)) == pytest.approx(9.2, abs=0.2)
 
@@ -389,7 +389,7 @@ HANYANG = {
 
 @pytest.mark.parametrize("sequence", HANYANG)
 def test_hanyang_against_its_files(sequence: str) -> None:
-    """Read anew: exact stamps, ranges made horizontal, and the figures of NOTES.md."""
+    """Read again: exact stamps, ranges made horizontal, and the figures of NOTES.md."""
     recording = recorded("hanyang", sequence)
     folder = data_root() / "hanyang_outdoor_uwb" / sequence
     (table,), (track,) = recording.streams["anchor_ranges"], recording.truth

@@ -20,13 +20,12 @@ from torch import Tensor
 from torchrl.envs import check_env_specs
 
 from agents.wrappers.correction import with_base
-from coloc_env.envs.actions import ActionMode, Pilot, check, make_mode
+from coloc_env.envs.actions import ActionMode, ModeRunner, checked_tensor, make_mode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.fixes import fixes, relative_fixes
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.pettingzoo import CoLocParallelEnv, env, parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.motion import Arena, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.observation import Observation
@@ -70,7 +69,7 @@ def single(scenario: Scenario, mode: str) -> CoLocParallelEnv:
     return with_base(made) if mode == "correction" else made.with_action(mode)
 
 
-def fly(made: CoLocEnv, actions: Tensor) -> list[TensorDictBase]:
+def simulate(made: CoLocEnv, actions: Tensor) -> list[TensorDictBase]:
     """What is seen before each step [K entries], with the rewards of the action taken in it."""
     now, seen = made.reset(), []
     for action in actions.unbind(2):
@@ -96,7 +95,7 @@ def test_displacements_add_up_from_the_prior(scenario: Scenario) -> None:
     actions = 3 * torch.rand(2, N, 6, dim) - 1.5
     assert (actions.abs() > 1).any()
     estimate = None
-    for step, seen in enumerate(fly(batched(scenario, "displacement", 2), actions)):
+    for step, seen in enumerate(simulate(batched(scenario, "displacement", 2), actions)):
         observation = seen["uav", "observation"]
         if estimate is None:
             estimate = observation["prior"][..., :dim].numpy().astype(np.float64)
@@ -109,9 +108,9 @@ def test_displacements_add_up_from_the_prior(scenario: Scenario) -> None:
         estimate = estimate + actions[:, :, step].numpy().astype(np.float64).clip(-1, 1)
         error = np.linalg.norm(estimate - truth(seen["state"], dim).numpy(), axis=-1)
         np.testing.assert_allclose(seen["next", "uav", "reward"][..., 0], -error, atol=2e-6)
-        told = seen["next", "uav", "observation", "messages"].unflatten(-1, (N, 3 * dim))
-        np.testing.assert_allclose(told[0, 0, 1:, :dim], estimate[0, 1:], atol=1e-5)
-        assert (told[0, 0, 1:, dim:] == 0).all(), "no velocity, a standard deviation of 1 m"
+        received = seen["next", "uav", "observation", "messages"].unflatten(-1, (N, 3 * dim))
+        np.testing.assert_allclose(received[0, 0, 1:, :dim], estimate[0, 1:], atol=1e-5)
+        assert (received[0, 0, 1:, dim:] == 0).all(), "no velocity, a standard deviation of 1 m"
 
 
 def test_the_exact_displacement_earns_exactly_zero() -> None:
@@ -211,11 +210,11 @@ def test_false_masks_leave_nothing() -> None:
 
 
 def test_without_noise_the_leaves_lead_to_the_truth() -> None:
-    """Attitude told and turned exactly, landmarks seen exactly: the fixes' mean is the way."""
+    """Attitude known and turned exactly, landmarks seen exactly: the fixes' mean is the way."""
     scenario = indoor(landmark_std=0.0, gyro_std=0.0, landmark_radius=40.0)
     scenario = replace(scenario, prior=Prior(position_std=1.0, attitude_std=0.0))
     made = batched(scenario, "displacement", 2)
-    for seen in fly(made, 2 * torch.rand(2, N, 6, 3) - 1):
+    for seen in simulate(made, 2 * torch.rand(2, N, 6, 3) - 1):
         observation = seen["uav", "observation"]
         error = seen["state"][:, -3 * N :].unflatten(-1, (N, 3))
         assert (observation["fix_share"] == 1).all()
@@ -232,7 +231,7 @@ def quaternion(wxyz: NDArray) -> Rotation:
 def test_the_attitude_follows_the_gyroscope() -> None:
     scenario = indoor(gyro_std=0.3)
     attitude = None
-    for seen in fly(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 3)):
+    for seen in simulate(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 3)):
         observation = seen["uav", "observation"]
         if attitude is None:
             attitude = quaternion(observation["prior"].numpy()[..., 6:10].astype(np.float64))
@@ -246,17 +245,17 @@ def test_the_attitude_follows_the_gyroscope() -> None:
 def test_the_heading_follows_the_odometry() -> None:
     scenario = plane()
     heading = None
-    for seen in fly(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 2)):
+    for seen in simulate(batched(scenario, "displacement", 2), torch.zeros(2, N, 6, 2)):
         observation = seen["uav", "observation"]
         turn = observation["odometry"].numpy()[..., 2].astype(np.float64)
-        told = observation["prior"].numpy()[..., 4].astype(np.float64)
-        heading = told if heading is None else heading + scenario.arena.dt * turn
+        given = observation["prior"].numpy()[..., 4].astype(np.float64)
+        heading = given if heading is None else heading + scenario.arena.dt * turn
         found = observation["attitude"].numpy()[..., 0]
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * heading), atol=1e-5)
 
 
 def test_without_a_gyroscope_the_attitude_stays_the_priors() -> None:
-    for seen in fly(
+    for seen in simulate(
         batched(indoor(imu=False, landmarks=0), "displacement"), torch.zeros(1, N, 4, 3)
     ):
         observation = seen["uav", "observation"]
@@ -353,7 +352,7 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
     scenario = indoor(n_uavs=2, failure_rate=1.0, horizon=9)
     torch.manual_seed(0)
     actions = 2 * torch.rand(3, 2, 25, 3) - 1
-    seen: Any = torch.stack(fly(batched(scenario, mode, 3), actions), 1)
+    seen: Any = torch.stack(simulate(batched(scenario, mode, 3), actions), 1)
     ends = seen["next", "done"][..., 0]
     assert not torch.equal(ends[0], ends[1])
     episodes = 0
@@ -364,7 +363,7 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
                 continue
             episodes += 1
             alone = batched(scenario, mode, seed=row + 3 * e)
-            again: Any = torch.stack(fly(alone, actions[row : row + 1, :, start:stop]), 1)[0]
+            again: Any = torch.stack(simulate(alone, actions[row : row + 1, :, start:stop]), 1)[0]
             part = seen[row, start:stop]
             for key in again.keys(True, True):
                 ours, theirs = part[key].numpy(), again[key].numpy()
@@ -376,18 +375,18 @@ def test_a_reset_of_some_rows_starts_their_memory_alone(mode: str) -> None:
 def test_a_pilot_gives_every_rows_leaves_when_some_start_anew(mode: str) -> None:
     scenario = indoor()
     world = World(scenario, 3)
-    pilot = Pilot(single(scenario, mode).mode, world)
+    runner = ModeRunner(single(scenario, mode).mode, world)
     world.reset(0)
-    pilot.reset()
+    runner.reset()
     for _ in range(2):
-        world.step(pilot.estimate(torch.full((3, N, 3), 0.7)))
-        before = pilot.observe()
+        world.step(runner.estimate(torch.full((3, N, 3), 0.7)))
+        before = runner.observe()
     rows = torch.tensor([False, True, False])
     world.reset(10, rows)
-    after = pilot.reset(rows)
+    after = runner.reset(rows)
     fresh_world = World(scenario, 3)
     fresh_world.reset(10)
-    fresh = Pilot(single(scenario, mode).mode, fresh_world).reset()
+    fresh = ModeRunner(single(scenario, mode).mode, fresh_world).reset()
     for name, leaf in after.items():
         assert torch.equal(leaf[[0, 2]], before[name][[0, 2]]), name
         torch.testing.assert_close(leaf[1], fresh[name][1], atol=1e-5, rtol=1e-5)
@@ -419,11 +418,11 @@ def test_a_whole_episode_is_its_seeds(mode: str) -> None:
     def episode(seed: int) -> list[str]:
         made = single(indoor(), mode)
         rng = np.random.default_rng(1)
-        told = [repr(made.reset(seed=seed))]
+        entries = [repr(made.reset(seed=seed))]
         while made.agents:
             actions = {agent: rng.uniform(-1, 1, 3).astype(np.float32) for agent in made.agents}
-            told.append(repr((made.step(actions), made.state().tolist())))
-        return told
+            entries.append(repr((made.step(actions), made.state().tolist())))
+        return entries
 
     first = episode(5)
     assert len(first) == 7
@@ -559,7 +558,7 @@ def test_actions_of_another_number_of_worlds_do_not_fit() -> None:
     scenario = indoor()
     mode = make_mode(scenario, "displacement")
     with refused("indoor-v0: actions of shape (3, 3, 3) do not fit: (2, 3, 3) (worlds, UAVs"):
-        check(scenario, mode, torch.zeros(3, N, 3), 2)
+        checked_tensor(scenario, mode, torch.zeros(3, N, 3), 2)
     made = batched(scenario, "displacement", 2)
     made.reset()
     with refused("actions of shape (2, 2, 3) do not fit: (2, 3, 3)"):
@@ -632,18 +631,20 @@ class Outspoken(Halves):
 
 @pytest.mark.parametrize("kind", [Silent, Outspoken])
 def test_memory_and_leaves_need_not_go_together(kind: type[ActionMode]) -> None:
-    """Where worlds start anew one by one, too."""
+    """Where worlds restart one by one, too."""
     scenario = indoor(n_uavs=2, failure_rate=1.0, horizon=9)
     torch.manual_seed(0)
     actions = 2 * torch.rand(3, 2, 16, 3) - 1
-    seen: Any = torch.stack(fly(CoLocEnv(scenario, 3, action=kind(scenario.believed)), actions), 1)
+    seen: Any = torch.stack(
+        simulate(CoLocEnv(scenario, 3, seed=0, action=kind(scenario.believed)), actions), 1
+    )
     ends = seen["next", "done"][..., 0]
     assert not torch.equal(ends[0], ends[1])
     for row in range(3):
         stop = int(ends[row].nonzero()[0]) + 1
         for seed, part in ((row, slice(0, stop)), (row + 3, slice(stop, stop + 2))):
             alone = CoLocEnv(scenario, seed=seed, action=kind(scenario.believed))
-            again: Any = torch.stack(fly(alone, actions[row : row + 1, :, part]), 1)[0]
+            again: Any = torch.stack(simulate(alone, actions[row : row + 1, :, part]), 1)[0]
             for key in again.keys(True, True):
                 ours, theirs = seen[row, part][key].numpy(), again[key].numpy()
                 np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=str(key))

@@ -10,9 +10,8 @@ from torchrl.envs import ExplorationType, RewardSum, TransformedEnv, check_env_s
 
 from agents.policies.learned import actor_for
 from agents.wrappers.correction import with_base
-from coloc_env.envs.per_uav import PerUavEnv
-from coloc_env.envs.torchrl import CoLocEnv
-from training.learning.collectors import fly
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
+from training.learning.collectors import episode_collector
 from training.learning.mappo import policy_of
 
 B, N, H = 3, 2, 5
@@ -108,13 +107,13 @@ def reset(env: PerUavEnv, now: TensorDictBase, rows: list[int]) -> TensorDictBas
     return env.reset(now.clone().set("_reset", chosen))
 
 
-def test_the_uavs_of_a_world_start_anew_together() -> None:
+def test_the_uavs_of_a_world_restart_together() -> None:
     env = PerUavEnv(worlds("displacement", 4))
     now = env.reset()
     now["action"] = torch.ones(B * N, 3)
     after = env.step(now)["next"]
     for rows in ([0], [row(1, 0), row(1, 1), row(2, 1)]):
-        words = "the UAVs of a world start anew together, not one by one"
+        words = "the UAVs of a world restart together, not one by one"
         with pytest.raises(ValueError, match=words):
             reset(env, after, rows)
     again = reset(env, after, [row(1, 0), row(1, 1)])
@@ -136,14 +135,14 @@ def test_a_seed_is_the_first_worlds() -> None:
 
 @pytest.mark.parametrize("mode", ["displacement", "correction"])
 def test_a_collector_flies_a_recurrent_policy(mode: str) -> None:
-    """Batches that end within an episode: memory goes on there, and starts anew with a world."""
+    """Batches that end within an episode: memory goes on there, and restarts with a world."""
     env = PerUavEnv(worlds(mode, 7, horizon=12))
     torch.manual_seed(0)
     actor = actor_for(env.mode, hidden=8, recurrent=True)
     with torch.no_grad():
         actor.head.layer.weight[:3] = torch.randn(3, 8)
     options = {"exploration_type": ExplorationType.DETERMINISTIC}
-    batches = [batch.clone() for batch in fly(env, policy_of(actor), 4, **options)]
+    batches = [batch.clone() for batch in episode_collector(env, policy_of(actor), 4, **options)]
     assert [batch.shape for batch in batches] == [torch.Size([B * N, 4])] * 3
     seen: Any = torch.cat(batches, 1)
     assert torch.equal(seen["is_init"][..., 0], (torch.arange(12) == 0).expand(B * N, 12))

@@ -21,7 +21,7 @@ from coloc_env.observation import stack
 from coloc_env.scenarios import SCENARIOS, make_scenario
 from coloc_env.world import World
 
-INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max")
+INFO_KEYS = ("error", "scored", "episode_rmse", "episode_mean", "episode_max", "seed")
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "failures": {"failure_rate": 0.8},
@@ -182,7 +182,8 @@ def test_infos_are_flat_numeric_and_always_have_the_same_keys() -> None:
     while True:
         for agent, info in infos.items():
             assert tuple(info) == INFO_KEYS
-            assert all(type(value) is float for value in info.values())
+            assert all(type(value) is float for key, value in info.items() if key != "seed")
+            assert info["seed"] == 0
             last[agent] = info
         if not environment.agents:
             break
@@ -190,11 +191,11 @@ def test_infos_are_flat_numeric_and_always_have_the_same_keys() -> None:
         for agent, info in infos.items():
             errors[agent].append(info["error"])
             assert info["scored"] == 1.0
-    for agent, told in last.items():
+    for agent, info in last.items():
         values = np.array(errors[agent])
-        np.testing.assert_allclose(told["episode_rmse"], np.sqrt((values**2).mean()), rtol=1e-5)
-        np.testing.assert_allclose(told["episode_mean"], values.mean(), rtol=1e-6)
-        assert told["episode_max"] == values.max()
+        np.testing.assert_allclose(info["episode_rmse"], np.sqrt((values**2).mean()), rtol=1e-5)
+        np.testing.assert_allclose(info["episode_mean"], values.mean(), rtol=1e-6)
+        assert info["episode_max"] == values.max()
 
 
 def test_observations_and_arrays_are_nobodys_but_the_agents() -> None:
@@ -298,8 +299,8 @@ def test_wrong_actions_are_named() -> None:
         (np.float32(0.0), "the action of uav_1 has shape (); (9,) finite numbers are needed"),
         (np.full(9, np.nan), "the action of uav_1 holds NaN or infinity"),
         (np.full(9, -np.inf), "the action of uav_1 holds NaN or infinity"),
-        (np.array(["x"] * 9), "the action of uav_1 is not numeric"),
-        (None, "the action of uav_1 has shape (); (9,) finite numbers are needed"),
+        (np.array(["x"] * 9), "the action of uav_1 is not made of real numbers"),
+        (None, "the action of uav_1 is not made of real numbers"),
     ):
         refused({**good, "uav_1": wrong}, words)  # type: ignore[dict-item]
 

@@ -19,9 +19,8 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from tensordict import TensorDictBase
 
 from agents.wrappers.correction import with_base
-from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.sb3 import CoLocVecEnv
-from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
 from coloc_env.scenarios import make_scenario
 
 B, N, H = 3, 2, 5
@@ -125,10 +124,10 @@ def test_every_uav_has_attributes_and_methods_of_its_own() -> None:
     assert env.get_attr("scenario", 0) == [env.scenario]
     env.set_attr("role", "leader", [1, 2])
     assert env.get_attr("role", [1, 2]) == ["leader", "leader"]
-    assert not hasattr(env.slots[0], "role")
+    assert not hasattr(env.sub_envs[0], "role")
     with pytest.raises(AttributeError):
         env.get_attr("role", 0)
-    whole = CoLocEnv(env.scenario, B, action="displacement").reset()["state"]
+    whole = CoLocEnv(env.scenario, B, seed=0, action="displacement").reset()["state"]
     for i, state in enumerate(env.env_method("state")):
         np.testing.assert_array_equal(state, whole[i // N])
     assert len(env.env_method("state", indices=[2])) == 1
@@ -197,11 +196,20 @@ def test_wrong_use_is_named() -> None:
         with pytest.raises(ValueError, match=re.escape("indoor-v0: call reset() first")):
             use()
     env.reset()
-    needed = "indoor-v0: finite actions of shape (6, 3) are needed, each displacement in m within"
-    for wrong in (np.zeros((6, 9)), np.zeros((3, 3)), np.full((6, 3), np.nan)):
+    needed = "indoor-v0: real numbers of shape (6, 3) are needed, each row displacement in m within"
+    wrong: np.ndarray
+    for wrong in (np.zeros((6, 9)), np.zeros((3, 3)), np.zeros((6, 3), complex), np.array("six")):
         with pytest.raises(ValueError, match=re.escape(needed)) as error:
             env.step(wrong)
-        assert str(error.value).endswith(f"got shape {wrong.shape}")
+        assert str(error.value).endswith(f"got {wrong.dtype} of shape {wrong.shape}")
+    for value in (np.nan, np.inf, 1e200):
+        wrong = np.zeros((6, 3))
+        wrong[4, 1] = value
+        words = (
+            "indoor-v0: the action of uav_0 in world 2 holds NaN or infinity; (3,) finite numbers"
+        )
+        with pytest.raises(ValueError, match=re.escape(words)):
+            env.step(wrong)
 
 
 # ---------------------------------------------------------------- algorithms

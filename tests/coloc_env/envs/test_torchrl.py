@@ -99,7 +99,7 @@ def test_the_horizon_truncates_and_never_terminates() -> None:
 
 
 def test_a_world_terminates_when_its_last_uav_fails_and_resets_alone() -> None:
-    env = CoLocEnv(num_envs=4, horizon=12, n_uavs=2, failure_rate=1.0)
+    env = CoLocEnv(num_envs=4, seed=0, horizon=12, n_uavs=2, failure_rate=1.0)
     rollout = env.rollout(60, constant(0.0), break_when_any_done=False)
     terminated = rollout["next", "terminated"][..., 0]
     alive = rollout["next", "uav", "mask"]

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from coloc_env.datasets import DataError, Recording, load
 from coloc_env.datasets.antenna_arrays import relative_poses
+from coloc_env.datasets.murp_poses import solved
 from coloc_env.geometry import Se3, quaternion_exp
-from coloc_env.motion import Recorded
+from coloc_env.motion import RecordedMotion
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
-from coloc_env.scenarios.replay_murp import solved
 from coloc_env.sensors import RecordedPoses, RelativePose
 from coloc_env.world import World
 
@@ -138,7 +138,7 @@ def test_relative_poses_against_the_motion_capture(trial: str, position: float, 
     whole = recording(trial)
     found = solved(whole, 60)
     motion = scenario(trial).motion
-    assert isinstance(motion, Recorded)
+    assert isinstance(motion, RecordedMotion)
     pose = torch.cat((motion.position.values, motion.attitude.values), -1)
     first, second = torch.tensor(found.pairs).unbind(-1)
     off = Se3.minus(found.pose[60:], Se3.between(pose[:, first], pose[:, second]))
@@ -176,7 +176,7 @@ def test_what_a_step_delivers() -> None:
                 expected = sensor.poses.values[:, match].float()
                 torch.testing.assert_close(leaf[:, uav, match], expected, rtol=0, atol=0)
     assert made.horizon == 146
-    assert made.guides == 1
+    assert made.anchor_uavs == 1
     assert (world.truth.position[0] == world.truth.position[1]).all()
 
 
@@ -219,9 +219,9 @@ def test_what_is_believed() -> None:
     assert (matches.outliers, matches.matches) == (0.0, 6)
     assert 0.15 < matches.std < 0.25
     assert 3 < matches.turn_std * DEGREES < 6
-    told = scenario(relative_pose_noise=(0.3, 9.0)).believed.sensor(RelativePose)
-    assert told is not None
-    assert (told.std, told.turn_std * DEGREES) == (0.3, pytest.approx(9))
+    given = scenario(relative_pose_noise=(0.3, 9.0)).believed.sensor(RelativePose)
+    assert given is not None
+    assert (given.std, given.turn_std * DEGREES) == (0.3, pytest.approx(9))
 
 
 def test_spans_and_refusals() -> None:
@@ -231,7 +231,7 @@ def test_spans_and_refusals() -> None:
         ({"calibration": 5.0}, "calibration=5.0 is not allowed: from 10 s to 158"),
         ({"calibration": 159.0}, "calibration=159.0 is not allowed"),
         ({"span": (20.0, 10.0)}, "span=.* is not allowed"),
-        ({"outliers": 1.5}, "outliers=1.5 is not allowed: a probability"),
+        ({"outliers": 1.5}, "outliers=1.5 is not allowed: a number from 0 to 1"),
     ):
         with pytest.raises(ValueError, match=rf"^replay-murp-v0: .*{words}"):
             scenario(**overrides)

@@ -1,4 +1,4 @@
-"""``replay-tiers-v0``: ranges against another file's distances, guides, what is believed."""
+"""``replay-tiers-v0``: ranges against another file's distances, anchors, what is believed."""
 
 import os
 from typing import Any
@@ -9,9 +9,9 @@ import torch
 
 from agents import make
 from coloc_env.datasets import DataError, Recording, data_root, load
+from coloc_env.datasets.pairs import calibrated_pairs, ordered, true_distances
 from coloc_env.scenario import ConstantVelocity, InsDriven, Scenario
 from coloc_env.scenarios import make_scenario
-from coloc_env.scenarios.replay_tiers import calibrated_pairs, ordered, true_distances
 from coloc_env.sensors import Ins, PositionFix, Ranging
 from coloc_env.world import World
 
@@ -119,24 +119,27 @@ def test_what_a_step_delivers() -> None:
 def test_what_the_team_believes() -> None:
     made = scenario(span=(0.0, 10.0))
     assert made.process == InsDriven()
-    assert made.guides == 2
+    assert made.anchor_uavs == 2
     assert [type(s) for s in made.believed_sensors] == [Ins, PositionFix, Ranging]
-    made = scenario(process="constant_velocity", velocity_accel_std=0.3, guides=(5, 1, 3))
+    made = scenario(process="constant_velocity", velocity_accel_std=0.3, anchor_robots=(5, 1, 3))
     assert made.process == ConstantVelocity(0.3)
-    assert made.guides == 3
+    assert made.anchor_uavs == 3
     assert [type(s) for s in made.believed_sensors] == [PositionFix, Ranging]
-    raw = scenario(calibrated=False, range_std=0.4, guides=())
-    assert raw.guides == 0
+    raw = scenario(calibrated=False, range_std=0.4, anchor_robots=())
+    assert raw.anchor_uavs == 0
     assert raw.believed_sensors[-1].noise.std == 0.4  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        ({"guides": (2,)}, r"guides=\(2,\) is not allowed: some, not all, of 1, 3, 4, 5"),
-        ({"guides": (1, 3, 4, 5)}, "is not allowed: some, not all"),
-        ({"guides": (5, 5)}, "is not allowed: some, not all"),
-        ({"calibration": -1.0}, "calibration=-1 is not allowed"),
+        (
+            {"anchor_robots": (2,)},
+            r"anchor_robots=\(2,\) is not allowed: some, not all, of 1, 3, 4, 5",
+        ),
+        ({"anchor_robots": (1, 3, 4, 5)}, "is not allowed: some, not all"),
+        ({"anchor_robots": (5, 5)}, "is not allowed: some, not all"),
+        ({"calibration": -1.0}, "calibration=-1.0 is not allowed"),
         ({"process": "wheeled"}, "one of ins, constant_velocity"),
         ({"dt": 0.3}, "deliver one pair twice within 0.3 s"),
     ],
@@ -148,35 +151,35 @@ def test_wrong_overrides(overrides: dict[str, Any], reason: str) -> None:
 
 
 def rmse(made: Scenario, agent: str) -> float:
-    """Of those that are not guides, over the second half of a run (m)."""
+    """Of those that are not anchors, over the second half of a run (m)."""
     localizer, world = make(agent, made), World(made, 1)
     observation, squared = world.reset(0), []
     belief = localizer.reset(observation)
     for _ in range(made.horizon):
         belief, estimate = localizer.step(belief, observation)
-        error = (estimate.position.double() - world.truth.position)[:, made.guides :]
+        error = (estimate.position.double() - world.truth.position)[:, made.anchor_uavs :]
         squared.append(error.square().sum(-1).mean())
         world.advance(estimate.action())
         observation = world.observation()
     return float(torch.stack(squared)[made.horizon // 2 :].mean().sqrt())
 
 
-def test_ranges_find_a_team_among_three_guides() -> None:
-    made = scenario(span=(60.0, 80.0), guides=(5, 1, 3))
+def test_ranges_find_a_team_among_three_anchors() -> None:
+    made = scenario(span=(60.0, 80.0), anchor_robots=(5, 1, 3))
     assert rmse(made, "map:confidence=huber") < 0.3
     assert rmse(made, "gn") < 0.3
     assert rmse(made, "dead_reckoning") > 0.6
 
 
-def test_a_prior_on_the_wrong_side_of_the_guides_traps_who_believes_it() -> None:
-    """World 0 of a prior of 2 m is told a place 4.5 m off. Another place fits the ranges by far
+def test_a_prior_on_the_wrong_side_of_the_anchors_traps_who_believes_it() -> None:
+    """World 0 of a prior of 2 m is given a place 4.5 m off. Another place fits the ranges by far
     better, and the snapshot finds it."""
-    made = scenario(span=(60.0, 80.0), guides=(5, 1, 3), prior_std=2.0)
+    made = scenario(span=(60.0, 80.0), anchor_robots=(5, 1, 3), prior_std=2.0)
     assert rmse(made, "gn") < 0.3
     assert rmse(made, "ekf_joint") > 1.0
 
 
 def test_calibration_pays() -> None:
-    overrides: dict[str, Any] = {"span": (60.0, 80.0), "guides": (5, 1, 3)}
+    overrides: dict[str, Any] = {"span": (60.0, 80.0), "anchor_robots": (5, 1, 3)}
     good, raw = (scenario(calibrated=c, **overrides) for c in (True, False))
     assert rmse(good, "gn") < rmse(raw, "gn")

@@ -158,13 +158,13 @@ def test_one_uav_alone_meets_nobody() -> None:
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ({"outliers": 1.2}, "outliers=1.2 is not allowed: a probability"),
-        ({"matches_per_step": 0}, "matches=0 is not allowed: at least one match"),
-        ({"relative_pose_noise": (-1.0, 2.0)}, "std=-1.0 is not allowed: a standard deviation"),
+        ({"outliers": 1.2}, "outliers=1.2 is not allowed: a number from 0 to 1"),
+        ({"matches_per_step": 0}, "matches_per_step=0 is not allowed: a whole number ≥ 1"),
+        ({"relative_pose_noise": (-1.0, 2.0)}, r"relative_pose_noise=\(-1.0, 2.0\) is not allowed"),
         ({"motion": "hover"}, "motion='hover' is not allowed: one of static, circle"),
         ({"motion": "static", "n_uavs": 10}, "motion=static is not allowed: only for at most 9"),
-        ({"dt": 0.0}, r"dt \(s\) and size \(m\) must be > 0"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: at least one UAV"),
+        ({"dt": 0.0}, "dt=0.0 is not allowed: a number > 0 in s"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
     ],
 )
 def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:

@@ -1,4 +1,4 @@
-"""The benchmark runs and writes what it says; how fast is not a matter for tests."""
+"""The benchmark runs and writes its numbers; how fast is not a matter for tests."""
 
 import json
 from pathlib import Path
@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from agents import LOCALIZERS, make
-from agents.particle import pf, renewal
+from agents.particle import filter as particle_filter
+from agents.particle import resampling
 from coloc_env.scenarios import make_scenario
 from training.bench.agents import TITLES, Task, tasks
 from training.bench.bench import NAMES, bench
-from training.bench.parts import REST, Stopwatch, _watching, step_parts
+from training.bench.parts import PROFILED, REST, Stopwatch, _watching, missing_parts, step_parts
 
 
 def test_a_quick_benchmark_writes_numbers_and_figures(
@@ -70,11 +71,17 @@ def test_the_time_of_a_step_is_put_down_to_its_parts(name: str, parts: set[str])
     assert min(found.values()) > 0
 
 
+def test_no_part_has_gone() -> None:
+    scenario = make_scenario("indoor-v0", n_uavs=2)
+    gone = missing_parts(make(name, scenario) for name in PROFILED)
+    assert not gone, f"renamed or removed, but still in training/bench/parts.py: {gone}"
+
+
 def test_watching_leaves_everything_as_it_was() -> None:
     scenario = make_scenario("indoor-v0", n_uavs=2)
     localizer: Any = make("pfnn", scenario)
-    before = pf.normal, renewal.moments, localizer.renewal.weigh
+    before = particle_filter.normal, resampling.moments, localizer.renewal.weigh
     with _watching(localizer, Stopwatch()):
-        during = pf.normal, renewal.moments, localizer.renewal.weigh
+        during = particle_filter.normal, resampling.moments, localizer.renewal.weigh
     assert all(one is not other for one, other in zip(before, during, strict=True))
-    assert (pf.normal, renewal.moments, localizer.renewal.weigh) == before
+    assert (particle_filter.normal, resampling.moments, localizer.renewal.weigh) == before

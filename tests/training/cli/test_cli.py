@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from training.cli.command import app
 from training.evaluation.evaluate import split_agents
-from training.evaluation.results import FIGURES, NAMES
+from training.evaluation.files import FIGURES, NAMES
 
 SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]
 CHECKOUT = Path(__file__).parents[3]
@@ -68,6 +68,10 @@ def test_what_raises_is_told(tmp_path: Path) -> None:
         (["evaluate", "indoor-v0", "--agents", "ekf", "--set", "dt"], "key=value"),
         (["evaluate", "indoor-v0", "--agents", "ekf", "--runs", "0"], "runs=0"),
         (["evaluate", "indoor-v0", "--agents", "ekf", "--threads", "0"], "--threads 0"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--threads", "100000"], "--threads 100000"),
+        (["evaluate", "indoor-v0", "--agents", "ekf", "--seed", "-1"], "--seed -1"),
+        (["render", "indoor-v0", "--seed", "-1"], "--seed -1"),
+        (["render", "indoor-v0", "--seed", str(2**64)], f"--seed {2**64}"),
         (["evaluate", "replay-mrclam-v0", "--agents", "ekf", "--data", "/no/where"], "/no/where"),
         (["render", "indoor-v0", "--steps", "0"], "--steps 0"),
         (["render", "indoor-v0", "--steps", "2000"], "1 to 1000"),
@@ -103,10 +107,23 @@ def test_output_is_checked_before_anything_is_computed(
     assert done.stderr == f"error: {tmp_path / 'file'} is not a folder\n"
     done = coloc("render", "indoor-v0", "--out", tmp_path / "file" / "a.gif")
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    (tmp_path / "link").symlink_to(tmp_path / "file" / "nowhere")
+    done = evaluate(tmp_path / "link", "--agents", "ekf")
+    assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    if os.geteuid():  # root may write anywhere
+        (tmp_path / "closed").mkdir(mode=0o500)
+        done = evaluate(tmp_path / "closed", "--agents", "ekf")
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert "cannot be written" in done.stderr
 
 
 @pytest.mark.parametrize(
-    "where", ["training.evaluation.evaluate.evaluate", "training.evaluation.results.write"]
+    "where",
+    [
+        "training.evaluation.evaluate.evaluate",
+        "training.evaluation.files.write",
+        "training.evaluation.files.write_figures",
+    ],
 )
 def test_an_interruption_leaves_nothing(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -116,7 +133,8 @@ def test_an_interruption_leaves_nothing(
 
     monkeypatch.setattr(where, interrupt)
     done = evaluate(tmp_path / "deep" / "out", "--agents", "test_still", "--no-bound")
-    assert (done.exit_code, done.stdout, done.stderr) == (130, "", "interrupted\n")
+    assert (done.exit_code, done.stderr) == (130, "interrupted\n")
+    assert ("test_still" in done.stdout) == (where != "training.evaluation.evaluate.evaluate")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -124,11 +142,74 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("training.evaluation.results.write", full)
+    monkeypatch.setattr("training.evaluation.files.write", full)
     done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-bound")
     assert done.exit_code == 2
+    assert "RMSE" in done.stdout
     assert done.stderr == "error: [Errno 28] No space left on device\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_results_are_kept_where_figures_cannot_be_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from training.evaluation import figures
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(figures, "consistency", full)
+    done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-bound")
+    assert done.exit_code == 1
+    assert "RMSE" in done.stdout
+    assert done.stderr == ("error: no figures could be drawn: [Errno 28] No space left on device\n")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(NAMES) - set(FIGURES)
+
+
+def test_one_agents_error_does_not_end_the_others(tmp_path: Path) -> None:
+    names = "test_still:wrong=missing,test_still"
+    done = evaluate(tmp_path / "out", "--agents", names, "--no-bound")
+    assert done.exit_code == 1
+    assert done.stderr == (
+        "error: test_still:wrong=missing has no results: NotImplementedError: not there yet\n"
+    )
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(NAMES)
+    agents = json.loads((tmp_path / "out" / "results.json").read_text())["agents"]
+    assert list(agents) == ["test_still", "test_still:wrong=missing"]
+    lost = agents["test_still:wrong=missing"]
+    assert list(lost) == list(agents["test_still"])
+    assert lost.pop("diagnostics") == {"error": "NotImplementedError: not there yet"}
+    assert lost.pop("per_uav_rmse") == [None, None]
+    assert set(lost.values()) == {None}
+    assert "`test_still:wrong=missing` ended in an error" in (tmp_path / "out/table.md").read_text()
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "training.cli.command", *arguments]
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "cp1252", "ascii"])
+def test_a_terminal_that_cannot_show_everything(encoding: str) -> None:
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PYTHONIOENCODING": encoding}
+    for arguments in (["scenarios", "indoor-v0"], ["evaluate", "--help"], ["agents", "≥"]):
+        done = subprocess.run(command(*arguments), env=environment, capture_output=True)
+        assert done.returncode == (2 if "≥" in arguments else 0), done.stderr
+        assert b"Traceback" not in done.stderr
+
+
+def test_results_are_kept_where_nobody_reads_the_table(tmp_path: Path) -> None:
+    arguments = ["evaluate", "indoor-v0", "--agents", "dead_reckoning", "--runs", "1", *SMALL]
+    arguments += ["--no-figures", "--no-bound", "--out", str(tmp_path / "out")]
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "MPLBACKEND": "module://no_such"}
+    process = subprocess.Popen(
+        command(*arguments), env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.wait(timeout=60)
+    assert (tmp_path / "out" / "results.json").exists()
 
 
 @pytest.mark.parametrize(("name", "frames"), [("a.gif", 3), ("a.png", 1)])

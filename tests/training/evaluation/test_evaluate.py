@@ -149,8 +149,8 @@ def test_diverged_runs_are_counted_and_kept() -> None:
 
 
 def test_figures_that_do_not_apply_are_null() -> None:
-    scene = scenario(horizon=5, n_uavs=1, comm_radius=5.0)
-    figures = evaluate(scene, ["test_still:wrong=raises"], runs=1, bound=False).summary["agents"]
+    task = scenario(horizon=5, n_uavs=1, comm_radius=5.0)
+    figures = evaluate(task, ["test_still:wrong=raises"], runs=1, bound=False).summary["agents"]
     (only,) = figures.values()
     for key in ("rmse_std", "rmse_after_10s", "nees", "avg_particles", "ms_per_step"):
         assert only[key] is None
@@ -161,32 +161,32 @@ def test_figures_that_do_not_apply_are_null() -> None:
 
 
 def test_errors_are_measured_from_the_reference_too() -> None:
-    """A UAV that says just what its reference does has no error from it; the truth has."""
-    scene = make_scenario("campus-v0", n_uavs=4, anchors=0.0, horizon=8, gps_cep=2.0)
-    results = evaluate(scene, ["dead_reckoning"], runs=2, seed=5, bound=False)
+    """A UAV that estimates just what its reference shows has no error from it; the truth has."""
+    task = make_scenario("campus-v0", n_uavs=4, anchor_share=0.0, horizon=8, gps_cep=2.0)
+    results = evaluate(task, ["dead_reckoning"], runs=2, seed=5, bound=False)
     (agent,) = results.agents.values()
     assert results.reference is not None
-    assert scene.reference is not None
-    again = scene.reference.errors(torch.tensor([6]), 8, 4, 3, 0.1)
+    assert task.reference is not None
+    again = task.reference.errors(torch.tensor([6]), 8, 4, 3, 0.1)
     np.testing.assert_array_equal(results.reference[1:], again)
-    told = {}
+    reported = {}
     for name, offset in (("reference", results.reference), ("truth", np.zeros_like(agent.offset))):
         posing = dataclasses.replace(agent, offset=offset)
         changed = dataclasses.replace(results, agents={name: posing})
-        told[name] = changed.summary["agents"][name]["diagnostics"]
-    assert told["reference"]["ate_reference"] == pytest.approx(0.0)
-    assert told["reference"]["fge_reference"] == pytest.approx(0.0)
-    assert told["truth"]["fge"] == pytest.approx(0.0)
+        reported[name] = changed.summary["agents"][name]["diagnostics"]
+    assert reported["reference"]["ate_reference"] == pytest.approx(0.0)
+    assert reported["reference"]["fge_reference"] == pytest.approx(0.0)
+    assert reported["truth"]["fge"] == pytest.approx(0.0)
     apart = np.linalg.norm(results.reference, axis=-1)
-    assert told["truth"]["ate_reference"] == pytest.approx(np.sqrt((apart**2).mean(1)).mean())
-    assert told["truth"]["fge_reference"] == pytest.approx(told["reference"]["fge"])
-    assert told["truth"]["fge_reference"] > 0.5
+    assert reported["truth"]["ate_reference"] == pytest.approx(np.sqrt((apart**2).mean(1)).mean())
+    assert reported["truth"]["fge_reference"] == pytest.approx(reported["reference"]["fge"])
+    assert reported["truth"]["fge_reference"] > 0.5
 
 
 def test_unscored_steps_do_not_count() -> None:
-    scene = scenario(horizon=20)
-    object.__setattr__(scene, "failures", ((0, 1), (1, 8)))
-    results = evaluate(scene, ["test_still"], runs=2, bound=False)
+    task = scenario(horizon=20)
+    object.__setattr__(task, "failures", ((0, 1), (1, 8)))
+    results = evaluate(task, ["test_still"], runs=2, bound=False)
     figures, error = results.summary["agents"]["test_still"], results.agents["test_still"].error
     kept = [error[:, 0, 0], error[:, :8, 1], error[:, :, 2]]
     assert figures["mean"] == pytest.approx(np.concatenate([x.ravel() for x in kept]).mean())
@@ -201,12 +201,12 @@ def test_threads_are_given_back() -> None:
 
 
 def test_progress() -> None:
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
     evaluate(
-        scenario(horizon=5), ["test_still"], runs=3, progress=lambda *x: told.append(x), chunk=2
+        scenario(horizon=5), ["test_still"], runs=3, progress=lambda *x: reported.append(x), chunk=2
     )
-    assert told[0] == ("bound", 0, 1)
-    done = [done for what, done, _ in told if what == "test_still"]
+    assert reported[0] == ("bound", 0, 1)
+    done = [done for what, done, _ in reported if what == "test_still"]
     assert done == [*range(2, 11, 2), *range(11, 16)]
 
 

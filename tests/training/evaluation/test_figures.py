@@ -11,8 +11,9 @@ from PIL import Image
 
 from coloc_env.bounds import Bound
 from training.evaluation.figures import consistency, draw, error_over_time, trajectories
+from training.evaluation.files import FIGURES
 from training.evaluation.record import RunRecord, Worlds
-from training.evaluation.results import FIGURES, Evaluation
+from training.evaluation.results import Evaluation
 
 
 def bounded(results: Evaluation) -> Evaluation:

@@ -20,10 +20,10 @@ def scenario(**overrides: object) -> Scenario:
     return make_scenario("indoor-v0", **{"n_uavs": 3, "horizon": 15} | overrides)
 
 
-def run(agent: str, scene: Scenario, seeds: torch.Tensor = SEEDS) -> tuple[SimpleNamespace, int]:
+def run(agent: str, task: Scenario, seeds: torch.Tensor = SEEDS) -> tuple[SimpleNamespace, int]:
     """A record's arrays as tensors, and how many steps of all runs were reported as done."""
     ticks: list[int] = []
-    found = record(make(agent, scene), scene, seeds, ticks.append)
+    found = record(make(agent, task), task, seeds, ticks.append)
     arrays = found.worlds.to_arrays() | found.to_arrays()[0]
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     series = {name: torch.from_numpy(array) for name, array in found.series.items()}
@@ -31,11 +31,11 @@ def run(agent: str, scene: Scenario, seeds: torch.Tensor = SEEDS) -> tuple[Simpl
 
 
 def test_a_record_says_what_single_worlds_say() -> None:
-    scene = scenario(failure_rate=0.5)
-    found, ticks = run("test_still:offset=0.1", scene)
+    task = scenario(failure_rate=0.5)
+    found, ticks = run("test_still:offset=0.1", task)
     assert ticks == len(SEEDS) * 15
     for row, seed in enumerate(SEEDS.tolist()):
-        world = World(scene)
+        world = World(task)
         prior = world.reset(seed)["prior"][0, :, :3].clone()
         for k in range(15):
             prior[:, :2] += 0.1
@@ -68,9 +68,9 @@ def test_nees_against_numpy() -> None:
 
 @pytest.mark.parametrize("wrong", ["nan", "huge"])
 def test_estimates_that_are_not_finite_hold_the_last_one(wrong: str) -> None:
-    scene = scenario()
-    found, _ = run(f"test_still:offset=0.1:wrong={wrong}:at=6:west=19", scene)
-    good, _ = run("test_still:offset=0.1", scene)
+    task = scenario()
+    found, _ = run(f"test_still:offset=0.1:wrong={wrong}:at=6:west=19", task)
+    good, _ = run("test_still:offset=0.1", task)
     struck = found.broken
     assert 0 < struck.sum() < len(SEEDS)
     assert torch.equal(found.error[~struck], good.error[~struck])
@@ -82,24 +82,24 @@ def test_estimates_that_are_not_finite_hold_the_last_one(wrong: str) -> None:
 
 
 def test_estimates_never_finite_hold_the_prior() -> None:
-    scene = scenario()
-    found, _ = run("test_still:wrong=nan", scene)
-    good, _ = run("test_still", scene)
+    task = scenario()
+    found, _ = run("test_still:wrong=nan", task)
+    good, _ = run("test_still", task)
     assert found.broken.all()
     assert torch.equal(found.error, good.error)
 
 
 def test_a_failed_uav_may_say_what_it_likes() -> None:
-    scene = scenario()
-    object.__setattr__(scene, "failures", ((0, 6),))
-    assert not run("test_still:wrong=nan:at=6", scene)[0].broken.any()
-    assert run("test_still:wrong=nan:at=5", scene)[0].broken.all()
+    task = scenario()
+    object.__setattr__(task, "failures", ((0, 6),))
+    assert not run("test_still:wrong=nan:at=6", task)[0].broken.any()
+    assert run("test_still:wrong=nan:at=5", task)[0].broken.all()
 
 
 def test_who_raises_is_found_and_others_go_on() -> None:
-    scene = scenario()
-    found, ticks = run("test_still:offset=0.1:wrong=raises:at=6:west=19", scene)
-    good, _ = run("test_still:offset=0.1", scene)
+    task = scenario()
+    found, ticks = run("test_still:offset=0.1:wrong=raises:at=6:west=19", task)
+    good, _ = run("test_still:offset=0.1", task)
     struck = found.broken
     assert ticks == len(SEEDS) * 15
     assert 0 < struck.sum() < len(SEEDS)
@@ -120,8 +120,8 @@ def test_what_is_not_numerical_is_raised() -> None:
 
 
 def test_a_record_survives_arrays() -> None:
-    scene = scenario()
-    found = record(make("test_still:offset=0.1:wrong=raises:at=6:west=19", scene), scene, SEEDS)
+    task = scenario()
+    found = record(make("test_still:offset=0.1:wrong=raises:at=6:west=19", task), task, SEEDS)
     arrays, facts = found.to_arrays()
     facts = json.loads(json.dumps(facts))
     worlds = Worlds.from_arrays(found.worlds.seed, found.worlds.to_arrays())
@@ -133,10 +133,10 @@ def test_a_record_survives_arrays() -> None:
 
 
 def test_blocks_of_runs_are_one_record() -> None:
-    scene = scenario()
-    localizer = make("ekf", scene)
-    whole = record(localizer, scene, SEEDS)
-    parts = [record(localizer, scene, part) for part in SEEDS.split(2)]
+    task = scenario()
+    localizer = make("ekf", task)
+    whole = record(localizer, task, SEEDS)
+    parts = [record(localizer, task, part) for part in SEEDS.split(2)]
     joined = RunRecord.cat(parts)
     np.testing.assert_array_equal(joined.error, whole.error)
     np.testing.assert_array_equal(joined.worlds.truth, whole.worlds.truth)

@@ -11,16 +11,9 @@ import pytest
 import torch
 
 from coloc_env.geometry import rotation_matrix
-from training.evaluation.results import (
-    COLUMNS,
-    FIGURES,
-    NAMES,
-    Evaluation,
-    csv_text,
-    markdown,
-    rows,
-    write,
-)
+from training.evaluation.files import FIGURES, NAMES, write
+from training.evaluation.results import Evaluation
+from training.evaluation.tables import COLUMNS, csv_text, markdown, rows
 from training.evaluation.tum import folder_names, quaternions, tum_text
 
 
@@ -35,7 +28,7 @@ def unscored(results: Evaluation) -> Evaluation:
 
 
 def test_folder(made_up: Evaluation, tmp_path: Path) -> None:
-    write(made_up, tmp_path, figures=False)
+    write(made_up, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(NAMES) - set(FIGURES)
     text = (tmp_path / "results.json").read_text(encoding="utf-8")
     summary = json.loads(text, parse_constant=refuse)
@@ -84,7 +77,7 @@ def test_a_method_that_raises_is_named(made_up: Evaluation) -> None:
 
 
 def test_tum_files_hold_scored_steps(made_up: Evaluation, tmp_path: Path) -> None:
-    write(made_up, tmp_path, figures=False)
+    write(made_up, tmp_path)
     folders = ["bad", "good-weights=a_b", "groundtruth"]
     assert sorted(path.name for path in (tmp_path / "tum").iterdir()) == folders
     dim = made_up.scenario.arena.dim

@@ -207,7 +207,7 @@ def test_every_scenario_of_the_plan_can_be_built(tmp_path: Path) -> None:
 
 
 def test_a_small_page(tmp_path: Path) -> None:
-    variants = ["case1", "case1-kidnap_at=18", "trained-q=1-r_believed=0.36"]
+    variants = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
     agents = ["pf", "hpff", "nnhpff", "nnhpff:main=pf@particles=500:threshold=1"]
     chosen: dict[str, Any] = {"agents": agents, "variants": variants, "steps": 25}
     reproduce(nnhpff(), Settings(tmp_path, 2, **chosen))

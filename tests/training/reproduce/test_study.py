@@ -286,7 +286,7 @@ def test_cost_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         ({"runs": 0}, "--runs 0"),
         ({"steps": 0}, "--steps 0"),
         ({"jobs": 0}, "--jobs 0"),
-        ({"seed": -1}, "--seed -1"),
+        ({"seed": -1}, "seed=-1"),
         ({"fresh": True, "report_only": True}, "nothing would be left"),
     ],
 )
@@ -295,25 +295,32 @@ def test_settings_are_refused(wrong: dict[str, int], words: str, tmp_path: Path)
         Settings(tmp_path, **({"runs": 1} | wrong))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kind", ["dangling", "dangling parent", "file", "foreign", "read-only"])
+@pytest.mark.parametrize("kind", ["circle", "file", "file above", "foreign", "read-only"])
 def test_folders_are_tried_before_anything_is_computed(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(work.Piece, "run", lambda *_: pytest.fail("computed"))
     out = tmp_path / "out"
-    if kind.startswith("dangling"):
-        out.symlink_to(tmp_path / "nowhere")
-        out = out / "below" if kind.endswith("parent") else out
-    elif kind == "file":
+    if kind == "circle":
+        out.symlink_to(out)
+    elif kind.startswith("file"):
         out.write_text("")
+        out = out / "below" if kind.endswith("above") else out
     elif kind == "foreign":
         out.mkdir()
         (out / "results.json").write_text("somebody else's")
     else:
         out.mkdir()
         monkeypatch.setattr("os.access", lambda *_: False)  # root may write everywhere
-    with pytest.raises(ValueError, match=r"link|not a folder|overwritten|cannot be written"):
+    with pytest.raises(ValueError, match=r"not a folder|overwritten|cannot be written"):
         reproduce(small(Cell(SMALL, ("ekf",), 1)), Settings(out, 1))
+
+
+def test_links_are_followed_even_if_they_dangle(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    run(tmp_path / "link", Cell(SMALL, ("test_still",), 1))
+    assert (tmp_path / "there" / "page.md").exists()
+    assert (tmp_path / "link").is_symlink()
 
 
 def test_a_report_of_nothing_is_refused(tmp_path: Path) -> None:

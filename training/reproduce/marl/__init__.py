@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from coloc_env.render.style import INK, MUTED
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.drawing import panels
 from training.reproduce.marl.plan import FILTERS, Plan, Target, plan
 from training.reproduce.measures import mean_error

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from training.evaluation.metrics import Flags, Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.learning.nnhpff import FAILED
 from training.reproduce.cost import COST
 from training.reproduce.measures import mean_error, quantile, rmse_of_all

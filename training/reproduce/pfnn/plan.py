@@ -10,7 +10,7 @@ from coloc_env.motion import MOTIONS
 from training.evaluation import metrics
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
-from training.learning.pfnn_online import learn_in_flight
+from training.learning.pfnn_online import learn_online
 from training.reproduce.cost import COST
 from training.reproduce.pfnn.paper import PROPOSED, RANGES
 from training.reproduce.results import Runs
@@ -31,7 +31,7 @@ DEFAULT, FIGURE_9 = "default", "figure 9"  # cells
 STEADY = 10.0  # s: from here on a filter has settled
 ONLINE = Kind(
     "online",
-    f"{__name__}:learn_online",
+    f"{__name__}:compute_online",
     f"{__name__}:load_online",
     ("training.learning.pfnn_online",),
 )
@@ -123,14 +123,14 @@ class Online:
     loss: Floats
 
 
-def learn_online(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+def compute_online(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
     """The paper's own experiment: the corrector learns from the truth in flight."""
-    found = learn_in_flight(piece.variant.build(), piece.runs, piece.seed, progress)
+    found = learn_online(piece.variant.build(), piece.runs, piece.seed, progress)
     return {key: getattr(found, key).numpy() for key in ("error", "count", "loss")}, {}
 
 
 def load_online(variant: Variant, arrays: Arrays, facts: Facts) -> Online:
-    """What ``learn_online`` made."""
+    """What ``compute_online`` made."""
     return Online(**arrays)
 
 

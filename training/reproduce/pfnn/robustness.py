@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from coloc_env.render.style import FLOOR, INK, MUTED, uav_colours
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.drawing import headline
 from training.reproduce.measures import rmse
 from training.reproduce.pfnn.plan import robust_agents, variants

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from training.evaluation import metrics
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cost import COST, MEMORY, Cost
 from training.reproduce.measures import largest, mean_error, rmse
 from training.reproduce.pfnn import paper

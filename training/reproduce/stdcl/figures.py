@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from coloc_env.render.style import MUTED
 from training.evaluation.figures import log_axis
 from training.evaluation.metrics import Floats
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cost import COST
 from training.reproduce.drawing import legend, panels
 from training.reproduce.measures import rmse_of_all

@@ -120,7 +120,7 @@ def record_links(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
         assert step.estimate is not None
         arrays["error"][k] = (step.estimate.position[0] - truth).norm(dim=-1).numpy()
         progress(agent, k + 1, steps)
-    arrays["error"][:, : scenario.guides] = np.nan
+    arrays["error"][:, : scenario.anchor_uavs] = np.nan
     return arrays, {}
 
 
@@ -156,12 +156,12 @@ class _Weights:
 
     def __init__(self, localizer: Any) -> None:
         base: SwarmFilter = getattr(localizer, "base", localizer)
-        weigh, variance = base.weigh, base.std**2
+        weights, variance = base.weights, base.std**2
         self.last: Floats = np.zeros((0, 0))
 
         def recorded(*given: Any) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
-            weight, shift = weigh(*given)
+            weight, shift = weights(*given)
             self.last = variance * weight[0].numpy()
             return weight, shift
 
-        base.weigh = recorded  # type: ignore[method-assign, assignment]
+        base.weights = recorded  # type: ignore[method-assign, assignment]

@@ -165,7 +165,7 @@ class Worlds:
     def recordings(self) -> list[Variant]:
         """Four ground robots, with and without velocities, and three UAVs."""
         later = ("span", (60.0, 208.0))  # on the first minute noise settings were chosen
-        slow = (("process", "constant_velocity"), ("guides", (5, 4)))
+        slow = (("process", "constant_velocity"), ("anchor_robots", (5, 4)))
         return [
             Variant(key, title, overrides, f"replay-{name}-v0", self.steps, bounded=False)
             for key, title, name, overrides in (

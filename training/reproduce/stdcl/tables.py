@@ -6,7 +6,7 @@ import numpy as np
 
 from coloc_env.bounds import SnapshotBound
 from training.evaluation import metrics
-from training.evaluation.results import short
+from training.evaluation.tables import short
 from training.reproduce.cost import COST, Cost
 from training.reproduce.measures import quantile, rmse, rmse_of_all, rmse_of_bound
 from training.reproduce.results import Results, Runs

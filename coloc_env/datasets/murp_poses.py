@@ -1,0 +1,97 @@
+"""MURP's relative poses, solved from its ranges."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import permutations
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from coloc_env.datasets.antenna_arrays import relative_poses
+from coloc_env.datasets.grid import Grid, common_grid
+from coloc_env.datasets.recording import DataError, Recording
+from coloc_env.datasets.replay import lever_arms, recorded_motion, recorded_ranges
+from coloc_env.geometry import Se3
+from coloc_env.sensors import Ranging
+
+DT = 1.0  # s: the recording has one row a second
+_HEIGHT_STD, _TILT_STD = 0.1, 0.05  # m, rad: of what is believed of the agents' heights and tilts
+_FEWEST = 12  # ranges that a pose is solved from
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Relative poses of M ordered pairs at T steps, solved from ranges, which are there, and what
+    their deviations were on the first part: m and rad an axis."""
+
+    pairs: tuple[tuple[int, int], ...]
+    pose: Float64[Tensor, "T M 7"]
+    covariance: Float64[Tensor, "T M 6 6"]
+    there: Bool[Tensor, "T M"]
+    std: float
+    turn_std: float
+
+
+@lru_cache(maxsize=4)
+def solved(recording: Recording, steps: int) -> Solved:
+    """The relative poses of all ordered pairs of agents at every second.
+
+    On the first ``steps`` seconds are calibrated, with the truth: each agent's mean height, the
+    bias (median) and robust deviation of the ranges between each two agents, and the deviations of
+    the solved poses (root mean square). The bias is taken off all ranges.
+    """
+    grid = common_grid(recording, DT, ())
+    motion = recorded_motion(recording, grid)
+    poses = torch.cat((motion.position.values, motion.attitude.values), -1)
+    ranges, there = _ranges(recording, grid)
+    pairs = tuple(permutations(range(len(recording.robots)), 2))
+    first, second = torch.tensor(pairs).unbind(-1)
+    truth = Se3.between(poses[:, first], poses[:, second])
+    arms = torch.from_numpy(recording.tags)
+    clean = torch.linalg.vector_norm(
+        Se3.act(truth.unsqueeze(-2), arms[second]).unsqueeze(-3) - arms[first].unsqueeze(-2), dim=-1
+    )
+    measured, known = ranges[:, first, second], there[:, first, second]
+    bias, std = torch.empty(len(pairs)).double(), torch.empty(len(pairs)).double()
+    for pair, (i, j) in enumerate(pairs):
+        both = [pair, pairs.index((j, i))]
+        error = (measured - clean)[:steps, both][known[:steps, both]]
+        bias[pair] = error.median()
+        std[pair] = 1.4826 * (error - bias[pair]).abs().median()
+    height = poses[:steps, :, 2].mean(0)
+    above = (height[second] - height[first]).expand(len(poses), -1)
+    pose, covariance = relative_poses(
+        (measured - bias[:, None, None]).flatten(0, 1),
+        known.flatten(0, 1),
+        (arms[0], arms[0]),
+        std.repeat(len(poses)),
+        above.flatten(),
+        math.sqrt(2) * _HEIGHT_STD,
+        math.sqrt(2) * _TILT_STD,
+    )
+    pose = pose.unflatten(0, (len(poses), -1))
+    off = Se3.minus(pose, truth)[:steps].square()
+    return Solved(
+        pairs,
+        pose,
+        covariance.unflatten(0, (len(poses), -1)),
+        known.sum((-1, -2)) >= _FEWEST,
+        float(off[..., :3].mean().sqrt()),
+        float(off[..., 3:].mean().sqrt()),
+    )
+
+
+def _ranges(recording: Recording, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Ranges [T, N, N, I, J] between antenna i of one agent and j of another, and which are
+    there."""
+    tags, robots = recording.tags.shape[1], len(recording.robots)
+    if not (recording.tags == recording.tags[0]).all():
+        raise DataError(f"{recording.name}: its agents carry different antennas")
+    recorded = recorded_ranges(recording, grid, Ranging(tags=lever_arms(recording))).series
+    shape = (robots, tags, tags)
+    ranges, there = (
+        recorded[leaf].values.unflatten(-1, shape) for leaf in ("ranges", "range_mask")
+    )
+    return ranges.double(), there > 0

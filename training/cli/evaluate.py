@@ -1,0 +1,117 @@
+"""``coloc evaluate``."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from training.cli.options import (
+    Data,
+    ScenarioName,
+    Seed,
+    Settings,
+    Threads,
+    build_scenario,
+    require_seed,
+)
+from training.cli.terminal import progress, show
+
+if TYPE_CHECKING:
+    from training.evaluation.results import Evaluation
+
+_TOO_WIDE = ("rmse_std", "mean", "avg_particles")  # columns left out on a terminal
+
+
+def evaluate(
+    scenario: ScenarioName,
+    agents: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,C",
+            help="Agents, with commas between; options follow a name after colons: "
+            "**ekf,ekf:robust=huber**.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")],
+    runs: Annotated[int, typer.Option(help="Worlds, seeded SEED, SEED + 1, …")] = 20,
+    seed: Seed = 0,
+    settings: Settings = None,
+    figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw figures.")] = True,
+    bound: Annotated[
+        bool, typer.Option("--bound/--no-bound", help="Compute the posterior bound.")
+    ] = True,
+    threads: Threads = 1,
+    data: Data = None,
+) -> None:
+    """Let agents meet the same worlds, and write how well each localizes.
+
+    The table is printed first. DIR receives results.json, results.csv, table.md, figures, and the
+    first run's trajectories as TUM files; results that are there already are replaced once
+    everything is done. If an agent ends in an error, or figures cannot be drawn, the rest is
+    written all the same, and the exit code is 1.
+
+    **Examples**
+
+    coloc evaluate indoor-v0 --agents ekf,pf500 --runs 20 --out results/indoor
+
+    coloc evaluate indoor-v0 --agents ekf,ekf:robust=huber --set nlos=0.3 --set landmarks=5
+    --out results/hard
+
+    coloc evaluate replay-mrclam-v0 --agents dead_reckoning,ekf --data ~/recordings --out results/uw
+    """
+    require_seed(seed)
+    from coloc_env.staging import staged_folder
+
+    built = build_scenario(scenario, settings, threads, data)
+    from training.evaluation import files
+    from training.evaluation.evaluate import evaluate as run
+    from training.evaluation.evaluate import split_agents
+
+    names = split_agents(agents)
+    drawn = True
+    with staged_folder(out, files.NAMES) as folder:
+        with progress() as bars:
+            found = run(built, names, runs, seed, bars, bound=bound)
+        with suppress(OSError, SystemExit):  # where nobody reads it, the files are still written
+            _show(found)
+        files.write(found, folder)
+        if figures:
+            drawn = _draw(found, folder)
+    typer.echo(f"written to {out}")
+    if found.errors or not drawn:
+        raise typer.Exit(1)
+
+
+def _show(found: "Evaluation") -> None:
+    """Print the table, and what went wrong."""
+    from training.evaluation.tables import COLUMNS, left_out, rows
+
+    columns = {key: title for key, title in COLUMNS.items() if key not in _TOO_WIDE}
+    show(["", *columns.values()], rows(found, columns))
+    if found.dropped:
+        typer.echo(f"note: {left_out(found)}", err=True)
+    for name, one in found.agents.items():
+        if one.messages:
+            count = f"{len(one.messages)} of {found.runs} runs"
+            what = f"{name} raised in {count}; first at {one.messages[0]}"
+            typer.echo(f"warning: {what}", err=True)
+    for name, error in found.errors.items():
+        typer.echo(f"error: {name} has no results: {error}", err=True)
+
+
+def _draw(found: "Evaluation", folder: Path) -> bool:
+    """Whether the figures could be drawn; if not, say why."""
+    os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend, say, is not here
+    from training.evaluation.files import write_figures
+
+    try:
+        with progress() as bars:
+            bars("figures", 0, 1)
+            write_figures(found, folder)
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        typer.echo(f"error: no figures could be drawn: {text}", err=True)
+        return False
+    return True

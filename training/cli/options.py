@@ -1,0 +1,50 @@
+"""Options that several commands have in common, and what they mean."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from training.threads import use_threads
+
+if TYPE_CHECKING:
+    from coloc_env.scenario import Scenario
+
+ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="See **coloc scenarios**.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override one setting of the scenario; repeat it for more. "
+        "**coloc scenarios SCENARIO** lists them.",
+    ),
+]
+Data = Annotated[
+    Path | None,
+    typer.Option("--data", metavar="DIR", help="Folder of recordings (sets COLOC_DATA)."),
+]
+Seed = Annotated[int, typer.Option(help="Seed of the first world.")]
+Threads = Annotated[int, typer.Option(help="CPU threads of torch.")]
+
+
+def build_scenario(
+    name: str, settings: list[str] | None, threads: int, data: Path | None
+) -> "Scenario":
+    """Prepare the process, and build a scenario from a command line."""
+    use_threads(threads)
+    if data is not None:
+        os.environ["COLOC_DATA"] = str(data)
+    from dataclasses import replace
+
+    from coloc_env.scenarios import make_scenario, parse_override
+
+    overrides = dict(parse_override(name, text) for text in settings or ())
+    return replace(make_scenario(name, **overrides), overrides=overrides)
+
+
+def require_seed(seed: int) -> None:
+    """Raise ValueError for a seed that is none."""
+    if not 0 <= seed < 2**62:
+        raise ValueError(f"--seed {seed} is not allowed: a whole number from 0 to 2^62")

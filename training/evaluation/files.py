@@ -1,0 +1,32 @@
+"""The folder of an evaluation: JSON, CSV, Markdown, TUM files and figures."""
+
+import json
+from pathlib import Path
+
+from training.evaluation.results import Evaluation
+from training.evaluation.tables import csv_text, markdown
+from training.evaluation.tum import write_tum
+
+FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
+NAMES = ("results.csv", "table.md", *FIGURES, "tum", "results.json")
+
+
+def write(results: Evaluation, folder: Path) -> None:
+    """Write everything but figures into an empty folder (a staged one: ``coloc_env.staging``)."""
+    text = json.dumps(results.summary, indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / "results.json").write_text(text + "\n", encoding="utf-8")
+    (folder / "results.csv").write_text(csv_text(results), encoding="utf-8")
+    (folder / "table.md").write_text(markdown(results), encoding="utf-8")
+    write_tum(results, folder / "tum")
+
+
+def write_figures(results: Evaluation, folder: Path) -> None:
+    """Draw all figures into the folder, or none if that raises."""
+    try:
+        from training.evaluation.figures import draw
+
+        draw(results, folder)
+    except BaseException:
+        for name in FIGURES:
+            (folder / name).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,121 @@
+"""Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from training.evaluation import metrics
+from training.evaluation.results import Evaluation, plain
+
+COLUMNS = {
+    "rmse": "RMSE",
+    "rmse_std": "± runs",
+    "mean": "mean",
+    "median": "median",
+    "max": "max",
+    "rmse_after_10s": "after 10 s",
+    "diverged_runs": "diverged",
+    "nees": "NEES",
+    "avg_particles": "particles",
+    "ms_per_step": "ms/step",
+    "ratio_to_bound": "× bound",
+}
+
+_EXPLAINED = """\
+Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs, ± its
+standard deviation over runs; max is the mean over runs and UAVs of the largest error. A run counts
+as diverged if a UAV's error stays above {:g} m over its last {:g} s, or if an estimate was not
+finite; it stays in every figure. NEES: {} is consistent, more is overconfident. ms/step: the whole
+team, one world, one thread."""
+
+
+def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
+    """The main table as text: one line for the bound, if known, and one per agent."""
+    keys = tuple(keys)
+    bound, lines = results.bound, []
+    if bound is not None:
+        known = {"rmse": bound.rmse, "rmse_after_10s": bound.rmse_after(10.0)}
+        lines.append(["bound", *(short(plain(known.get(key))) for key in keys)])
+    for name, found in results.summary["agents"].items():
+        lines.append([name, *(short(found[key]) for key in keys)])
+    return lines
+
+
+def markdown(results: Evaluation) -> str:
+    """The main table, paired differences to the first agent, and what the words mean."""
+    names, dim = list(results.agents), results.scenario.arena.dim
+    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    if results.scenario.overrides:
+        chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
+        text += ["Overrides: " + ", ".join(chosen) + ".", ""]
+    text += table(["agent", *COLUMNS.values()], rows(results))
+    text += ["", _EXPLAINED.format(results.lost_beyond, metrics.LOST_SECONDS, dim)]
+    if len(names) > 1 and results.runs > 1:
+        differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
+        text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
+        text += table(["agent", "mean difference", "95 % interval"], differences)
+    for name, one in results.agents.items():
+        if one.messages:
+            how_many = f"{len(one.messages)} of {results.runs} runs"
+            text += ["", f"`{name}` raised in {how_many}; the first at {one.messages[0]}"]
+    for name, error in results.errors.items():
+        text += ["", f"`{name}` ended in an error: {error}"]
+    if results.dropped:
+        text += ["", left_out(results)]
+    return "\n".join(text) + "\n"
+
+
+def left_out(results: Evaluation) -> str:
+    """What of a recording was left out."""
+    streams = ", ".join(f"{count} of {stream}" for stream, count in results.dropped.items())
+    return f"Left out of the recording, since no sensor can have measured it: {streams}."
+
+
+def typed(value: Any) -> str:
+    """A setting as it would be typed on a command line."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(typed, value))
+    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
+
+
+def csv_text(results: Evaluation) -> str:
+    """One line per agent; empty where a figure does not apply."""
+    lines = []
+    for name, found in results.summary["agents"].items():
+        per_uav = {f"rmse_uav_{i}": x for i, x in enumerate(found["per_uav_rmse"])}
+        line = {k: v for k, v in found.items() if k not in ("per_uav_rmse", "diagnostics")}
+        lines.append({"agent": name} | line | found["diagnostics"] | per_uav)
+    out = io.StringIO()
+    columns = list(dict.fromkeys(key for line in lines for key in line))
+    writer = csv.DictWriter(out, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return out.getvalue()
+
+
+def _interval(results: Evaluation, a: str, b: str) -> list[str]:
+    difference = results.paired_difference(a, b)
+    return [signed(difference.mean), f"{signed(difference.low)} to {signed(difference.high)}"]
+
+
+def table(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1) -> list[str]:
+    """The lines of a Markdown table; all columns but the first ``left`` are set right."""
+    every = [header, [*["---"] * left, *["---:"] * (len(header) - left)], *lines]
+    return ["| " + " | ".join(cells) + " |" for cells in every]
+
+
+def signed(value: float) -> str:
+    """Two digits and a sign."""
+    return f"{value:+.2g}".replace("-", "−")
+
+
+def short(value: float | None) -> str:
+    """Three digits, no exponent where it can be helped."""
+    if value is None:
+        return "–"
+    if isinstance(value, int) or 100 <= abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.3g}"
