@@ -34,7 +34,7 @@ Progress = Callable[[str, int, int], None]
 _CONFIG, _STATE = "run.json", "state.safetensors"
 _MOST = 10**9  # of anything that can be chosen; seeds included
 _EVER = 1 << 62  # frames: the flights end a training, not a number of frames
-_VERSIONS = ("coloc", "torch", "torchrl", "tensordict", "safetensors", "numpy")
+_VERSIONS = ("coloc-env", "torch", "torchrl", "tensordict", "safetensors", "numpy")
 
 
 class Epochs(Protocol):
