@@ -52,11 +52,18 @@ LOCALIZERS = Registry(
 def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     """Build a localizer for what the scenario's team believes (or for those beliefs).
 
-    ``name`` may carry options as on the command line (``"ekf:robust=huber"``). Raises ValueError,
-    in one line that names what is allowed, for an unknown name or option, and for a team that
-    measures what the localizer would ignore.
+    ``name`` may carry options as on the command line (``"ekf:robust=huber"``); a piece without "="
+    belongs to the option before, so that paths may have colons. Raises ValueError, in one line that
+    names what is allowed, for an unknown name or option, and for a team that measures what the
+    localizer would ignore.
     """
-    name, *texts = name.split(":")
+    name, *pieces = name.split(":")
+    texts: list[str] = []
+    for piece in pieces:
+        if texts and "=" not in piece:
+            texts[-1] += f":{piece}"
+        else:
+            texts.append(piece)
     factory = LOCALIZERS.require(name)
     known = options.of(factory)
     for text in texts:
@@ -82,14 +89,14 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
     One that uses whatever has a measurement model goes on without a sensor that has none, as long
     as something is left to use, and warns of it.
     """
-    from agents.models.measurements import MODELS
+    from agents.models.measurements import model_of
 
     ignored = _ignored(factory, believed)
     if not ignored:
         return
     measuring = [sensor for sensor in believed.sensors if sensor.informs]
     general = getattr(factory, "serves", None) is None
-    if general and any(type(sensor) in MODELS for sensor in measuring):
+    if general and any(model_of(type(sensor)) for sensor in measuring):
         warnings.warn(
             f"{name}: {', '.join(ignored)} has no measurement model and is not used "
             "(agents.models.measurements.measures registers one)",

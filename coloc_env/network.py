@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box
+from coloc_env.options import Coordinate, Count, Group, PositiveCount, PositiveMetres, Share
 from coloc_env.sensors.base import in_slots, require, squared_norm
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
@@ -163,6 +165,48 @@ class Network:
         receiver = torch.arange(n, device=keys.device).unsqueeze(-1)
         directed = noise.fold(keys[..., None, None], receiver * n + neighbours)
         return reach & (noise.uniform(directed, "network.loss", 1)[..., 0] >= self.loss)
+
+
+@dataclass(frozen=True)
+class NetworkOptions(Group):
+    """UAVs up to ``comm_radius`` m apart (none: however far) measure each other and exchange
+    messages. In each step a link is broken for both with probability ``link_failure``, and carries
+    no message one way with probability ``message_loss``; messages take ``message_delay`` steps more
+    than the one that they always take.
+    """
+
+    title: ClassVar[str] = "network"
+
+    comm_radius: PositiveMetres | None = None
+    link_failure: Share = 0.0
+    message_loss: Share = 0.0
+    message_delay: Count = 0
+
+    def network(self, **others: Any) -> Network:
+        """The network; ``others``: fields of ``Network`` that are no options."""
+        return Network(
+            radius=self.comm_radius,
+            loss=self.message_loss,
+            delay=self.message_delay,
+            failure=self.link_failure,
+            **others,
+        )
+
+
+@dataclass(frozen=True)
+class WalledNetworkOptions(NetworkOptions):
+    """``walls``: boxes ``x0,y0,z0,x1,y1,z1`` (several: one after the other) that no signal passes.
+    In teams of more than ``max_neighbours`` each UAV has as many, the nearest."""
+
+    max_neighbours: PositiveCount = 16
+    walls: tuple[Coordinate, ...] | None = None
+
+    def network(self, **others: Any) -> Network:
+        walls = self.walls or ()
+        if len(walls) % 6:
+            raise ValueError(f"walls={walls} is not allowed: six numbers a box, x0,y0,z0,x1,y1,z1")
+        boxes = tuple((walls[i : i + 3], walls[i + 3 : i + 6]) for i in range(0, len(walls), 6))
+        return super().network(walls=boxes, max_neighbours=self.max_neighbours, **others)
 
 
 def _squared_distances(position: Float64[Tensor, "R K N d"]) -> Float64[Tensor, "R K N N"]:

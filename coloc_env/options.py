@@ -36,7 +36,7 @@ class Quantity:
 
     def allows(self, value: float) -> bool:
         """Whether a number lies within the bounds (NaN does not)."""
-        sane = abs(value) <= _MOST or (self.infinite and math.isinf(value))
+        sane = abs(value) <= _MOST or (self.infinite and abs(value) == math.inf)
         return sane and self.least <= value <= self.most and value > self.above
 
     def words(self) -> str:
@@ -58,6 +58,7 @@ class OneOf:
     names: tuple[str, ...]
 
 
+Coordinate = Annotated[float, Quantity("m")]
 Metres = Annotated[float, Quantity("m", 0.0)]
 PositiveMetres = Annotated[float, Quantity("m", above=0.0)]
 Seconds = Annotated[float, Quantity("s", 0.0)]
@@ -65,10 +66,12 @@ PositiveSeconds = Annotated[float, Quantity("s", above=0.0)]
 Speed = Annotated[float, Quantity("m/s", 0.0)]
 PositiveSpeed = Annotated[float, Quantity("m/s", above=0.0)]
 Acceleration = Annotated[float, Quantity("m/s²", 0.0)]
+WhiteAcceleration = Annotated[float, Quantity("m/s²/√Hz", 0.0)]
 AngularRate = Annotated[float, Quantity("rad/s", 0.0)]
 Radians = Annotated[float, Quantity("rad", 0.0)]
 Degrees = Annotated[float, Quantity("°", 0.0)]
 Share = Annotated[float, Quantity("", 0.0, 1.0)]
+Ratio = Annotated[float, Quantity("", 0.0)]
 Factor = Annotated[float, Quantity("", above=0.0)]
 Count = Annotated[int, Quantity("", 0)]
 PositiveCount = Annotated[int, Quantity("", 1)]
@@ -83,14 +86,15 @@ class Group:
 @dataclass(frozen=True)
 class Option:
     """One option: its type, its default (``inspect.Parameter.empty``: it must be given), the title
-    of the group that it belongs to, and the parameter that takes the group (None: the option is a
-    parameter itself)."""
+    of the group that it belongs to and what is ``about`` that, and the parameter that takes the
+    group (None: the option is a parameter itself)."""
 
     name: str
     annotation: Any
     default: Any
     group: str = ""
     parameter: str | None = None
+    about: str = ""
 
     @property
     def unit(self) -> str:
@@ -123,16 +127,22 @@ def of(function: Callable[..., Any]) -> dict[str, Option]:
             continue
         kind = parameter.annotation
         if isinstance(kind, type) and issubclass(kind, Group):
+            hints, about = typing.get_type_hints(kind, include_extras=True), _about(kind)
             for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-                default = getattr(parameter.default, field.name)
-                hint = typing.get_type_hints(kind, include_extras=True)[field.name]
-                found[field.name] = Option(field.name, hint, default, kind.title, name)
+                default, hint = getattr(parameter.default, field.name), hints[field.name]
+                found[field.name] = Option(field.name, hint, default, kind.title, name, about)
         else:
             found[name] = Option(name, kind, parameter.default)
     if isinstance(function, type) and any(p.kind is p.VAR_KEYWORD for p in own.values()):
         extended = of(function.__mro__[1])
         return found | {name: one for name, one in extended.items() if name not in found}
     return found
+
+
+def _about(group: type[Group]) -> str:
+    """What the docstrings of a group, and before them of those it extends, say of its options."""
+    kinds = [kind for kind in group.__mro__[::-1] if issubclass(kind, Group) and kind is not Group]
+    return " ".join(text for kind in kinds for text in paragraphs(kind.__doc__ or ""))
 
 
 def checked(owner: str, chosen: Mapping[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:

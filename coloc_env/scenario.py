@@ -4,44 +4,80 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from coloc_env.motion import Arena, Motion
 from coloc_env.network import Network
+from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Share
 from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor
 from coloc_env.sensors.base import Layout, require
 
-REWARDS = ("error", "squared", "team", "log_score")
+Reward = Literal["error", "squared", "team", "log_score"]
+REWARDS: tuple[str, ...] = get_args(Reward)
+PriorKind = Literal["gaussian", "uniform"]
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What each UAV is told about its own start.
+    """What each UAV knows about its own start.
 
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
-    world; ``kind="uniform"`` tells nothing of the position but that it lies in the arena, and with
+    world; with ``kind="uniform"`` nothing of the position but that it lies in the arena, and with
     ``max_speed`` (m/s) nothing of the velocity but that each component lies within ± that.
     """
 
     position_std: float = 2.0
     velocity_std: float = 0.2
     attitude_std: float = 0.05
-    kind: str = "gaussian"
+    kind: PriorKind = "gaussian"
     max_speed: float | None = None
 
     def __post_init__(self) -> None:
-        kinds = ("gaussian", "uniform")
+        kinds = get_args(PriorKind)
         require(self.kind in kinds, self, "kind", f"one of {', '.join(kinds)}")
         for name in ("position_std", "velocity_std", "attitude_std"):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
-        told = self.max_speed is None or (self.kind == "uniform" and 0 < self.max_speed < inf)
-        require(told, self, "max_speed", "a speed > 0, with kind='uniform'")
+        bounded = self.max_speed is None or (self.kind == "uniform" and 0 < self.max_speed < inf)
+        require(bounded, self, "max_speed", "a speed > 0, with kind='uniform'")
 
     @property
     def velocity_spread(self) -> float:
-        """Standard deviation (m/s) of the velocity about what is told of it."""
+        """Standard deviation (m/s) of the velocity about its prior mean."""
         return self.velocity_std if self.max_speed is None else self.max_speed / 3**0.5
+
+
+@dataclass(frozen=True)
+class PriorOptions(Group):
+    """What each UAV knows of its start. ``prior=gaussian``: the truth give or take ``prior_std`` m
+    per axis; ``uniform``: only that it is in the arena, and that no component of its velocity
+    exceeds ``max_speed`` (none: its velocity, as in a Gaussian prior).
+    """
+
+    title: ClassVar[str] = "prior"
+
+    prior: PriorKind = "gaussian"
+    prior_std: Metres = 2.0
+    max_speed: PositiveSpeed | None = None
+
+    def at_start(self, velocity_std: float = 0.2, attitude_std: float = 0.05) -> Prior:
+        """The prior; standard deviations in m/s and rad of what the options do not say."""
+        speed = self.max_speed if self.prior == "uniform" else None
+        return Prior(self.prior_std, velocity_std, attitude_std, self.prior, speed)
+
+
+@dataclass(frozen=True)
+class TeamOptions(Group):
+    """``n_uavs``: how many UAVs there are; each fails in an episode with probability
+    ``failure_rate``, at any step. ``reward``: minus the position ``error``, its square
+    (``squared``), the ``team``'s mean error, or the ``log_score`` of estimate and covariance.
+    """
+
+    title: ClassVar[str] = "team"
+
+    n_uavs: PositiveCount = 6
+    failure_rate: Share = 0.0
+    reward: Reward = "error"
 
 
 @dataclass(frozen=True)
@@ -82,7 +118,7 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class InsDriven:
-    """Dead reckoning with the velocity that the INS says.
+    """Dead reckoning with the velocity that the INS measures.
 
     Its error counts as white, of variance ``std² + bias_share · bias²`` per axis (m²/s², std and
     bias those of the believed ``Ins``): a bias that lasts adds up faster than white noise of the
@@ -124,8 +160,8 @@ class Scenario:
 
     ``failure_rate``: probability that a UAV fails, at a uniformly drawn step, during an episode;
     ``failures``: ((uav, step), …) for failures at given steps. ``reward``: one of ``REWARDS``.
-    ``guides``: the first so many UAVs know where they are and are not scored. ``reference``: what
-    is to be reported beside the truth as if it were the truth (None: nothing).
+    ``anchor_uavs``: the first so many UAVs know where they are and are not scored. ``reference``:
+    what is to be reported beside the truth as if it were the truth (None: nothing).
     """
 
     name: str
@@ -140,8 +176,8 @@ class Scenario:
     believed_prior: Prior | None = None
     failure_rate: float = 0.0
     failures: tuple[tuple[int, int], ...] = ()
-    reward: str = "error"
-    guides: int = 0
+    reward: Reward = "error"
+    anchor_uavs: int = 0
     reference: SatelliteReference | None = None
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
@@ -152,8 +188,8 @@ class Scenario:
         require(0 <= self.failure_rate <= 1, self, "failure_rate", "a probability in [0, 1]")
         known = all(0 <= uav < self.arena.n_uavs and step >= 1 for uav, step in self.failures)
         require(known, self, "failures", "((uav index, step ≥ 1), …)")
-        fewer = 0 <= self.guides < self.arena.n_uavs
-        require(fewer, self, "guides", f"from 0 to fewer than the {self.arena.n_uavs} UAVs")
+        fewer = 0 <= self.anchor_uavs < self.arena.n_uavs
+        require(fewer, self, "anchor_uavs", f"from 0 to fewer than the {self.arena.n_uavs} UAVs")
 
     @cached_property
     def layout(self) -> Layout:

@@ -182,8 +182,8 @@ def sense(
     leaves["links"] = heard.to(torch.float32)
     dense = network.dense(arena.n_uavs)
     scored = alive if moved.valid is None else alive & moved.valid
-    if scenario.guides:
-        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.guides)
+    if scenario.anchor_uavs:
+        scored = scored & (torch.arange(arena.n_uavs, device=keys.device) >= scenario.anchor_uavs)
     if not dense:
         leaves["neighbours"] = (neighbours * reach).to(torch.float32)
     sensed = Sensed(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class Tape:
+class Series:
     """A tensor [T, …] read by step on any device; after the last step it stays there."""
 
     values: Shaped[Tensor, "T *rest"]

@@ -28,7 +28,7 @@ class Step(NamedTuple):
     """What one step of the world brings.
 
     ``error`` is the position error in m of the estimates just scored, 0 where ``scored`` is False
-    (a guide, a failed UAV, or a recording without truth at that moment).
+    (an anchor UAV, a failed UAV, or a recording without truth at that moment).
     """
 
     reward: Float32[Tensor, "B N"]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.policies.actor import Actor
-from agents.weights import card_of, drawn_from, load
+from agents.weights import drawn_from, learned
 from agents.wrappers.correction import Correction
 from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
@@ -23,11 +23,11 @@ def mode_of(believed: Believed, settings: dict[str, Any]) -> ActionMode:
     kinds: dict[Any, Any] = {kind.name: kind for kind in (Correction, Displacement)}
     options = dict(settings)
     kind = options.pop("name", None)
-    if kind not in kinds:
+    if not isinstance(kind, str | None) or kind not in kinds:
         raise ValueError(f"action mode {kind!r} is not one that policies have: {', '.join(kinds)}")
     try:
         mode: ActionMode = kinds[kind](believed, **options)
-    except TypeError as error:
+    except (AttributeError, TypeError) as error:
         raise ValueError(f"action mode {kind!r}: {error}") from None
     return mode
 
@@ -67,24 +67,18 @@ class PolicyAgent(Localizer[PolicyBelief]):
             with drawn_from(0):
                 self.actor = actor_for(self.mode)
         else:
-            card = card_of(weights)
-            if card["kind"] != Actor.kind:
-                raise ValueError(
-                    f"{weights} holds weights of kind {card['kind']!r}: a policy's are needed"
-                )
-            try:
-                with drawn_from(0):
-                    self.actor = Actor(**card["architecture"])
-            except (AttributeError, KeyError, TypeError) as error:
-                raise ValueError(f"{weights}: its card describes no policy: {error}") from None
+            self.actor = learned(Actor, weights)
             self.mode = mode_of(believed, self.actor.architecture["mode"])
+            if self.mode.settings != self.actor.architecture["mode"]:
+                raise ValueError(
+                    f"{weights}: its card's mode is incomplete: {self.mode.settings} is needed"
+                )
             known, given = self.actor.architecture["inputs"], inputs_of(self.mode)
             if known != given:
                 raise ValueError(
                     f"{weights} was trained on the leaves {_words(known)}: this scenario has "
                     f"{_words(given)}"
                 )
-            load(weights, self.actor)
         self.actor.requires_grad_(False)
 
     @classmethod

@@ -13,6 +13,7 @@ from agents.localizer import Estimate, Localizer
 from agents.stdcl.features import Memory, Scene, forgotten, look
 from agents.stdcl.network import Correction, Past, StGnn
 from agents.swarm import joint
+from agents.swarm.among_anchors import is_plain
 from agents.swarm.belief import Found, Prepared, SwarmBelief
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import along_links, lengths
@@ -57,6 +58,10 @@ class NetworkLoop(Localizer[LoopBelief]):
 
     def __init__(self, base: SwarmFilter, network: StGnn, feedback: Feedback) -> None:
         super().__init__(base.believed)
+        if not is_plain(base.believed):
+            raise ValueError(
+                "a team is needed whose motion an INS drives, with ranges between centres"
+            )
         self.base, self.feedback = base, feedback
         self.rate = min(1.0, base.believed.arena.dt / _PACE)
         self.network = network.double().requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Filters that trust each measurement as far as a network says: ``ekf_trust``, ``pfnn_trust``."""
+"""The cooperative EKF with learned trust in each measurement."""
 
 from typing import Any
 

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from coloc_env.bounds.information import SHARED, own_information, shared_information
+from coloc_env.bounds.information import own_information, shared_information
 from coloc_env.geometry import rotate_by
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
@@ -39,7 +39,7 @@ def pose_information(
     own = truth.position.new_zeros(*truth.position.shape[:2], size, size)
     shared = None
     for sensor in sensors:
-        if isinstance(sensor, SHARED):
+        if sensor.between_uavs:
             joint = shared_information(sensor, truth, seen)
             shared = joint if shared is None else shared + joint
         elif not isinstance(sensor, Imu | Ins | Odometry):

@@ -33,8 +33,6 @@ from coloc_env.sensors import (
 )
 from coloc_env.sensors.ranging import Tags, tag_positions
 
-SHARED = (Ranging, UavBearings)  # sensors between UAVs
-
 
 @singledispatch
 def own_information(

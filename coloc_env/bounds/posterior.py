@@ -37,7 +37,6 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.bounds.expected import expected_information
-from coloc_env.bounds.information import SHARED
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
 from coloc_env.bounds.worlds import seeds_of, worlds
@@ -113,7 +112,7 @@ def _bound(
     pose, dim = model.pose(), scenario.arena.dim
     n = scenario.arena.n_uavs if cooperative else 1
     states = (len(seeds), scenario.arena.n_uavs, pose.shape[1])
-    sensors = [s for s in true_sensors(scenario) if cooperative or not isinstance(s, SHARED)]
+    sensors = [s for s in true_sensors(scenario) if cooperative or not s.between_uavs]
     prior = torch.block_diag(*n * [prior_covariance(model, scenario)])
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
     before: Kinematics | None = None

@@ -18,7 +18,7 @@ from coloc_env.geometry import cross_matrix, rotation_between, rotation_matrix, 
 from coloc_env.motion import Kinematics
 from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
-from coloc_env.sensors.base import Recorded
+from coloc_env.sensors.base import RecordedSensor
 
 Jacobians = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B N E E"]]
 S = TypeVar("S", bound=Sensor)
@@ -196,8 +196,8 @@ def prior_covariance(model: ErrorModel, scenario: Scenario) -> Float64[Tensor, "
 
 
 def true_sensors(scenario: Scenario) -> list[Sensor]:
-    """What measures truly; of a recording, the sensor its tape is described by."""
-    return [s.sensor if isinstance(s, Recorded) else s for s in scenario.sensors]
+    """What measures truly; of a recording, the sensor that describes its leaves."""
+    return [s.sensor if isinstance(s, RecordedSensor) else s for s in scenario.sensors]
 
 
 def strapdown_jacobians(

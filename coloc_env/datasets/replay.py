@@ -1,4 +1,4 @@
-"""From a Recording to what a scenario needs: its motion, and its sensors as tapes."""
+"""From a Recording to what a scenario needs: its motion, and its sensors as series by step."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from coloc_env.datasets.grid import (
     truth_on,
 )
 from coloc_env.datasets.recording import Floats, Recording, Table
-from coloc_env.motion import Arena, Recorded
+from coloc_env.motion import Arena, RecordedMotion
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
@@ -26,19 +26,19 @@ from coloc_env.sensors import (
     Odometry,
     Ranging,
     RecordedImu,
+    RecordedSensor,
     UavBearings,
 )
-from coloc_env.sensors import Recorded as RecordedSensor
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 
-def recorded_motion(recording: Recording, grid: Grid) -> Recorded:
+def recorded_motion(recording: Recording, grid: Grid) -> RecordedMotion:
     """The team's truth on the grid; steps without truth within 50 ms are not valid."""
     tracks = [truth_on(grid, track) for track in recording.truth]
     position, velocity, attitude, valid = (
-        Tape(torch.from_numpy(np.stack(parts, 1))) for parts in zip(*tracks, strict=True)
+        Series(torch.from_numpy(np.stack(parts, 1))) for parts in zip(*tracks, strict=True)
     )
-    return Recorded(position, velocity, attitude, valid)
+    return RecordedMotion(position, velocity, attitude, valid)
 
 
 def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
@@ -58,12 +58,12 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
 
 def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) -> RecordedSensor:
     """Leaf ``imu`` with a calibrated bias (gyro rad/s, accel m/s²; [N, 6]) taken off."""
-    tapes = []
+    robots = []
     for table, own in zip(recording.streams["imu"], bias, strict=True):
         leaf = imu_on(grid, table, own[:3])
         leaf[:, :3] -= own[3:]
-        tapes.append(leaf)
-    return RecordedSensor(sensor, {"imu": _tape(tapes)})
+        robots.append(leaf)
+    return RecordedSensor(sensor, {"imu": _series(robots)})
 
 
 def recorded_imu_samples(
@@ -79,20 +79,20 @@ def recorded_imu_samples(
         pad = ((0, 0), (0, width - lasting.shape[1]))
         samples.append(np.pad(forces, (*pad, (0, 0))).reshape(grid.count, -1))
         durations.append(np.pad(lasting, pad))
-    mean = recorded_imu(recording, grid, sensor, bias).tape
-    tapes = {"imu_samples": _tape(samples), "imu_held": _tape(durations)}
-    return RecordedImu(sensor, mean | tapes)
+    mean = recorded_imu(recording, grid, sensor, bias).series
+    whole = {"imu_samples": _series(samples), "imu_held": _series(durations)}
+    return RecordedImu(sensor, mean | whole)
 
 
 def recorded_odometry(
     recording: Recording, grid: Grid, sensor: Odometry, delay: float, scale: float
 ) -> RecordedSensor:
     """Leaf ``odometry``: commands taken to act ``delay`` s later, ``scale`` times as strongly."""
-    tapes = []
+    robots = []
     for table in recording.streams["odometry"]:
         acting = Table(table.time + round(delay * 1e9), scale * table.values, table.columns)
-        tapes.append(odometry_on(grid, acting))
-    return RecordedSensor(sensor, {"odometry": _tape(tapes)})
+        robots.append(odometry_on(grid, acting))
+    return RecordedSensor(sensor, {"odometry": _series(robots)})
 
 
 def recorded_bearings(
@@ -112,14 +112,14 @@ def recorded_bearings(
     pad = [((0, 0), (0, depth - mask.shape[1]), (0, 0)) for mask in there]
     values = [np.pad(v, (*p, (0, 0))) for v, p in zip(values, pad, strict=True)]
     there = [np.pad(m, p) for m, p in zip(there, pad, strict=True)]
-    tape = {
-        f"{name}s": _tape([v.reshape(grid.count, -1) for v in values]),
-        f"{name}_mask": _tape([m.reshape(grid.count, -1) for m in there]),
+    series = {
+        f"{name}s": _series([v.reshape(grid.count, -1) for v in values]),
+        f"{name}_mask": _series([m.reshape(grid.count, -1) for m in there]),
     }
     maps = {}
     if to_landmarks:
         maps["landmark_map"] = torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)
-    return RecordedSensor(sensor, tape, maps), depth
+    return RecordedSensor(sensor, series, maps), depth
 
 
 def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> RecordedSensor:
@@ -129,8 +129,8 @@ def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> Record
         ((t.values[:, 1] * tags + t.values[:, 0]) * tags + t.values[:, 2]).astype(np.int64)
         for t in recording.streams["uav_ranges"]
     ]
-    tape = _ranges(recording, grid, "uav_ranges", slots, robots * tags**2, slice(3, 4))
-    return RecordedSensor(sensor, {"ranges": tape[0], "range_mask": tape[1]})
+    ranges, there = _ranges(recording, grid, "uav_ranges", slots, robots * tags**2, slice(3, 4))
+    return RecordedSensor(sensor, {"ranges": ranges, "range_mask": there})
 
 
 def recorded_anchor_ranges(
@@ -143,9 +143,9 @@ def recorded_anchor_ranges(
         for t in recording.streams["anchor_ranges"]
     ]
     count = anchors * sensor.n_tags
-    tape = _ranges(recording, grid, "anchor_ranges", slots, count, slice(2, 3))
+    ranges, there = _ranges(recording, grid, "anchor_ranges", slots, count, slice(2, 3))
     maps = {"anchor_map": torch.from_numpy(recording.anchors.ravel()).to(torch.float32)}
-    return RecordedSensor(sensor, {"anchor_ranges": tape[0], "anchor_range_mask": tape[1]}, maps)
+    return RecordedSensor(sensor, {"anchor_ranges": ranges, "anchor_range_mask": there}, maps)
 
 
 def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> RecordedSensor:
@@ -154,8 +154,8 @@ def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> Recorde
     return RecordedSensor(
         sensor,
         {
-            "height": _tape([values for values, _ in tables]),
-            "height_mask": _tape([there[:, None] for _, there in tables]),
+            "height": _series([values for values, _ in tables]),
+            "height_mask": _series([there[:, None] for _, there in tables]),
         },
     )
 
@@ -174,7 +174,7 @@ def _ranges(
     slots: Sequence[np.ndarray],
     count: int,
     columns: slice,
-) -> tuple[Tape, Tape]:
+) -> tuple[Series, Series]:
     values, there = [], []
     for table, slot in zip(recording.streams[stream], slots, strict=True):
         seen, mask = slots_on(grid, table, slot, count, columns)
@@ -185,10 +185,10 @@ def _ranges(
             )
         values.append(seen[:, 0, :, 0])
         there.append(mask[:, 0])
-    return _tape(values), _tape(there)
+    return _series(values), _series(there)
 
 
-def _tape(robots: Sequence[np.ndarray]) -> Tape:
+def _series(robots: Sequence[np.ndarray]) -> Series:
     """One leaf of all robots, [T, N, F] float32."""
     stacked: Tensor = torch.from_numpy(np.stack(robots, 1)).to(torch.float32)
-    return Tape(stacked)
+    return Series(stacked)

@@ -5,22 +5,25 @@ given is kept, or refused with a ``ValueError`` that says what fits. Velocity is
 position, in closed form. Positions in m, times in s, angles in rad, z up.
 """
 
+from typing import Annotated
+
 from coloc_env.motion.aggressive import Aggressive
 from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
 from coloc_env.motion.court import Court
 from coloc_env.motion.curves import Circle, FigureEight, Helix
 from coloc_env.motion.formation import FormationChange
-from coloc_env.motion.kidnapped import Kidnapped
+from coloc_env.motion.kidnapped import KidnapOptions, Kidnapped
 from coloc_env.motion.lanes import Line, Square
 from coloc_env.motion.patrol import Patrol
 from coloc_env.motion.random_circles import RandomCircles
 from coloc_env.motion.random_helices import RandomHelices
 from coloc_env.motion.random_velocity import RandomVelocity
-from coloc_env.motion.recorded import Recorded
+from coloc_env.motion.recorded import RecordedMotion
 from coloc_env.motion.split import Split
 from coloc_env.motion.stop_and_go import StopAndGo
 from coloc_env.motion.waypoints import Waypoints
 from coloc_env.motion.weave import Weave
+from coloc_env.options import OneOf
 
 MOTIONS: dict[str, Motion] = {
     "circle": Circle(),
@@ -35,6 +38,7 @@ MOTIONS: dict[str, Motion] = {
     "formation": FormationChange(),
     "random_velocity": RandomVelocity(),
 }
+MotionName = Annotated[str, OneOf(tuple(MOTIONS))]
 
 __all__ = [
     "MOTIONS",
@@ -47,15 +51,17 @@ __all__ = [
     "FigureEight",
     "FormationChange",
     "Helix",
+    "KidnapOptions",
     "Kidnapped",
     "Kinematics",
     "Line",
     "Motion",
+    "MotionName",
     "Patrol",
     "RandomCircles",
     "RandomHelices",
     "RandomVelocity",
-    "Recorded",
+    "RecordedMotion",
     "Split",
     "Square",
     "StopAndGo",

@@ -1,12 +1,14 @@
-"""Kidnapping: a UAV is put somewhere else from one step to the next, and nothing tells it."""
+"""Kidnapping: a UAV is put somewhere else from one step to the next, and nothing reports it."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
+from coloc_env.options import Count, Group, PositiveSeconds
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,7 @@ class Kidnapped(Motion):
 
     Position and velocity are those of the motion turned by half a turn about the arena's vertical
     axis, so they stay in the box; the attitude is kept (gyroscopes measure while a UAV is carried).
-    ``uavs``: indices of those that are carried; None: all, and then ranges between them tell
+    ``uavs``: indices of those that are carried; None: all, and then ranges between them show
     nothing.
     """
 
@@ -52,3 +54,26 @@ class Kidnapped(Motion):
             moved.valid,
             (steps == self.at) & taken,
         ), carry
+
+
+@dataclass(frozen=True)
+class KidnapOptions(Group):
+    """At ``kidnap_at`` s (none: never) the UAVs ``kidnapped`` (their numbers; none: all) are put on
+    the arena's other side, and nothing reports it to them."""
+
+    title: ClassVar[str] = "kidnapping"
+
+    kidnap_at: PositiveSeconds | None = None
+    kidnapped: tuple[Count, ...] | None = None
+
+    def of(self, motion: Motion, dt: float) -> Motion:
+        """The motion, with its UAVs kidnapped."""
+        if self.kidnap_at is None:
+            if self.kidnapped is not None:
+                raise ValueError(f"kidnapped={self.kidnapped} is not allowed: only with kidnap_at")
+            return motion
+        if self.kidnap_at < dt:
+            raise ValueError(
+                f"kidnap_at={self.kidnap_at} is not allowed: a step's {dt:g} s at least"
+            )
+        return Kidnapped(motion, round(self.kidnap_at / dt), self.kidnapped)

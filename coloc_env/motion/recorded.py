@@ -1,4 +1,4 @@
-"""Replay: the truth is a tape."""
+"""Replay: the truth is a recording."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,21 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from coloc_env.motion.base import Arena, Carry, Kinematics, Motion
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded(Motion):
-    """Motion from tapes of T steps, the same for every world; after the last step it stays there.
+class RecordedMotion(Motion):
+    """Motion from series of T steps, the same for every world; after the last step it stays there.
 
     ``position`` and ``velocity`` [T, N, d], ``attitude`` [T, N, a] in the frames and units of
     ``Kinematics``, float64; ``valid`` [T, N] marks the steps with truth to score against.
     """
 
-    position: Tape
-    velocity: Tape
-    attitude: Tape
-    valid: Tape | None = None
+    position: Series
+    velocity: Series
+    attitude: Series
+    valid: Series | None = None
 
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
         length = len(self.position.values)
@@ -31,11 +31,11 @@ class Recorded(Motion):
             "attitude": (length, arena.n_uavs, 4 if arena.dim == 3 else 1),
         }
         for name, shape in shapes.items():
-            tape = getattr(self, name).values
-            if tuple(tape.shape) != shape or tape.dtype != torch.float64:
+            series = getattr(self, name).values
+            if tuple(series.shape) != shape or series.dtype != torch.float64:
                 raise ValueError(
-                    f"Recorded: {name} must be float64 of shape {shape}, "
-                    f"not {tape.dtype} of shape {tuple(tape.shape)}"
+                    f"RecordedMotion: {name} must be float64 of shape {shape}, "
+                    f"not {series.dtype} of shape {tuple(series.shape)}"
                 )
         return {}
 

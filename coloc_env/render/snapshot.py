@@ -58,17 +58,17 @@ def take(world: World, estimates: torch.Tensor | None) -> Snapshot:
         for kind in ("landmark", "anchor")
     }
     alive = world.alive[0].cpu().numpy()
-    guides = alive & (np.arange(len(alive)) < world.scenario.guides)
-    known = sensed.scored[0, now].cpu().numpy() | guides
+    anchors = alive & (np.arange(len(alive)) < world.scenario.anchor_uavs)
+    known = sensed.scored[0, now].cpu().numpy() | anchors
     position = np.where(known[:, None], truth.position[0].cpu().numpy(), np.nan)
     unknown = np.full_like(position, np.nan)
     estimate, std = unknown, unknown
     if estimates is not None:
         values = estimates[0].detach().cpu().numpy().astype(float)
-        told = (alive & ~guides)[:, None]  # nobody asks a guide
-        estimate = np.where(told, values[:, :dim], np.nan)
+        shown = (alive & ~anchors)[:, None]  # nobody asks an anchor UAV
+        estimate = np.where(shown, values[:, :dim], np.nan)
         log_std = np.clip(values[:, 2 * dim :], -10.0, 10.0)
-        std = np.where(told, np.exp(log_std), np.nan)
+        std = np.where(shown, np.exp(log_std), np.nan)
     watching = int(np.argmax(alive)) if alive.any() else -1
     return Snapshot(
         step=int(world.step_index[0]),

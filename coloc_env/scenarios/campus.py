@@ -2,13 +2,21 @@
 section 6, simulated)."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from coloc_env.motion import Arena, Box, Court, Motion, Patrol, Split
-from coloc_env.network import Network
+from coloc_env.network import NetworkOptions
+from coloc_env.options import Metres, PositiveCount, PositiveSeconds, Quantity
 from coloc_env.reference import SatelliteReference
-from coloc_env.scenario import InsDriven, Prior, Scenario
-from coloc_env.sensors import Clock, Ins, PositionFix, RangeNoise, Ranging, Sensor
+from coloc_env.scenario import InsDriven, PriorOptions, Scenario, TeamOptions
+from coloc_env.sensors import (
+    AnchorUavOptions,
+    Clock,
+    InsOptions,
+    Ranging,
+    Sensor,
+    UavRangeOptions,
+)
 
 # Metres. Zone A is a court without obstacles, zone B what surrounds the building.
 SIZE = (320.0, 120.0, 40.0)
@@ -38,98 +46,60 @@ _FLIGHTS: dict[str, tuple[Motion, int]] = {  # and how many s they take
 def campus(
     *,
     flight: Literal["s1", "s2", "s3"] = "s2",
-    n_uavs: int = 10,
-    dt: float = 0.1,
-    horizon: int | None = None,
-    anchors: float = 0.3,
-    anchor_std: float = 0.1,
-    uwb_std: float = 0.2,
-    believed_uwb_std: float | None = None,
-    wall_loss: float = 4.3,
-    wall_excess: float = 0.08,
-    nlos: float = 0.0,
-    nlos_bias: float = 1.0,
-    nlos_kind: Literal["exponential", "constant"] = "exponential",
-    uwb_dropout: float = 0.0,
-    clock_offset: float = 0.2,
-    clock_skew: float = 0.1,
-    ins_std: float = 0.3,
-    ins_bias: float = 0.2,
-    ins_bias_time: float = 60.0,
-    comm_radius: float = 400.0,
-    link_failure: float = 0.0,
-    message_loss: float = 0.0,
-    message_delay: int = 0,
-    prior_std: float = 2.0,
-    failure_rate: float = 0.0,
-    gps_cep: float = 2.0,
-    reward: str = "error",
+    dt: PositiveSeconds = 0.1,
+    horizon: PositiveCount | None = None,
+    wall_loss: Annotated[float, Quantity("dB/m", 0.0, infinite=True)] = 4.3,
+    wall_excess: Annotated[float, Quantity("m/m", 0.0)] = 0.08,
+    clock_offset: Metres = 0.2,
+    clock_skew: Metres = 0.1,
+    gps_cep: Metres = 2.0,
+    team: TeamOptions = TeamOptions(n_uavs=10),
+    anchor_uavs: AnchorUavOptions = AnchorUavOptions(anchor_share=0.3),
+    ranges: UavRangeOptions = UavRangeOptions(),
+    ins: InsOptions = InsOptions(ins_std=0.3, ins_bias=0.2),
+    network: NetworkOptions = NetworkOptions(comm_radius=400.0),
+    prior: PriorOptions = PriorOptions(),
 ) -> Scenario:
-    """A swarm over a campus of 320 × 120 m at 10 Hz, each UAV with the velocity that its INS says
-    and its distance to every other within ``comm_radius`` m, and between some of them a building,
-    a box of 100 × 24 × 20 m.
+    """A swarm over a campus of 320 × 120 m with a building of 100 × 24 × 20 m in it; ten times a
+    second each UAV has its velocity by an INS and its distances to the others in reach.
 
     ``flight``: ``s1``, figure eight and breathing circle over the court (120 s); ``s2``, two
     sub-teams part, pass the building on both sides and meet again (100 s); ``s3``, pseudo-random
-    patrol between court and building (900 s); ``horizon`` steps (default: the flight's).
+    patrol between court and building (900 s); ``horizon`` steps (none: the flight's).
 
-    ``anchors``: share of the UAVs that know where they are, to ``anchor_std`` m per axis, and are
-    not scored. Three of ten: as few as fix a team in space but for a mirror. They are the first
-    ones, so that in ``s2`` one sub-team has none of them. The paper names none for its flights,
-    though no method there yields positions from ranges alone; it has 15 % of them elsewhere.
+    Three of ten UAVs know where they are: as few as fix a team in space but for a mirror. They are
+    the first ones, so that in ``s2`` one sub-team has none of them. The paper names none for its
+    flights, though no method there yields positions from ranges alone; it has 15 % of them
+    elsewhere. Nor does it say how noisy ranges in sight are.
 
     ``wall_loss`` dB and ``wall_excess`` m per metre of the line of sight inside the building: of
     concrete (ITU-R P.2040, 4 GHz: ε = 5.31, σ = 0.10 S/m) 71 dB and √ε − 1 = 1.30 m, in a building
     that is 6 % walls and floors along the line. Infinite: nothing gets through; 0: what no
-    shadowing takes (see ``Network``). A range that does get through also has a bias of
-    ``nlos_bias`` m on average, for the first path found is seldom the direct one; ``nlos``: share
-    of the other ranges with one. ``clock_offset`` and ``clock_skew``: see ``Clock``. The paper does
-    not say how noisy ranges are otherwise.
-
-    The team believes ranges to be N(d, ``believed_uwb_std``²) (default: ``uwb_std``), and the INS
-    as it is, its bias counted over 1 s as in ``swarm-v0``. ``gps_cep``: of the reference that the
-    paper has instead of the truth (see ``SatelliteReference``), for evaluation alone.
+    shadowing takes (see ``Network``). Every range that does get through has the bias of NLOS, too:
+    the first path found is seldom the direct one. ``clock_offset`` and ``clock_skew``: see
+    ``Clock``. ``gps_cep``: of the reference that the paper has instead of the truth (see
+    ``SatelliteReference``), for evaluation alone. The INS's bias counts over 1 s, as in
+    ``swarm-v0``.
     """
-    if not dt > 0:
-        raise ValueError(f"dt={dt} is not allowed: a time in s > 0")
+    n_uavs = team.n_uavs
     if n_uavs < 2:
         raise ValueError(f"n_uavs={n_uavs} is not allowed: at least two UAVs")
-    if not 0 <= anchors < 1:
-        raise ValueError(f"anchors={anchors} is not allowed: a share in [0, 1)")
-    guides = round(anchors * n_uavs)
-    motion, lasts = _FLIGHTS[flight]
-    error = RangeNoise(uwb_std, nlos, nlos_bias, nlos_kind, dropout=uwb_dropout)
-    assumed = RangeNoise(uwb_std if believed_uwb_std is None else believed_uwb_std)
-    own: tuple[Sensor, ...] = (Ins(ins_std, ins_bias, ins_bias_time),)
-    if guides:
-        own = (*own, PositionFix(anchor_std, guides))
-    clocks = Clock(clock_offset, clock_skew)
-    ranging = Ranging(
-        error,
-        walls=(BUILDING,),
-        excess=wall_excess,
-        clock=clocks,
-    )
+    motion, duration = _FLIGHTS[flight]
+    own: tuple[Sensor, ...] = (ins.sensor, *anchor_uavs.fixes(n_uavs))
+    clock, latency = Clock(clock_offset, clock_skew), ranges.uwb_delay
+    ranging = Ranging(ranges.true, (), latency, (BUILDING,), wall_excess, clock)
     return Scenario(
         name="campus-v0",
         arena=Arena(3, n_uavs, dt, (0.0, 0.0, 0.0), SIZE),
-        horizon=math.ceil(lasts / dt) if horizon is None else horizon,
+        horizon=math.ceil(duration / dt) if horizon is None else horizon,
         motion=motion,
         sensors=(*own, ranging),
-        network=Network(
-            comm_radius,
-            (BUILDING,),
-            message_loss,
-            message_delay,
-            max_neighbours=n_uavs,
-            failure=link_failure,
-            wall_loss=wall_loss,
-        ),
-        prior=Prior(position_std=prior_std),
+        network=network.network(walls=(BUILDING,), max_neighbours=n_uavs, wall_loss=wall_loss),
+        prior=prior.at_start(),
         process=InsDriven(2.0 / dt),
-        believed_sensors=(*own, Ranging(assumed, clock=clocks)),
-        failure_rate=failure_rate,
-        reward=reward,
-        guides=guides,
+        believed_sensors=(*own, Ranging(ranges.believed, latency=latency, clock=clock)),
+        failure_rate=team.failure_rate,
+        reward=team.reward,
+        anchor_uavs=anchor_uavs.count(n_uavs),
         reference=SatelliteReference(gps_cep),
     )

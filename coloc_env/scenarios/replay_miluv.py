@@ -15,12 +15,20 @@ from coloc_env.datasets.replay import (
     recorded_ranges,
 )
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, Inertial, Prior, Process, Scenario
-from coloc_env.scenarios.replay import cut, loaded
+from coloc_env.options import (
+    Acceleration,
+    AngularRate,
+    Metres,
+    PositiveSeconds,
+    PositiveSpeed,
+    WhiteAcceleration,
+)
+from coloc_env.scenario import ConstantVelocity, Inertial, PriorOptions, Process, Reward, Scenario
+from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
-    Imu,
+    ImuOptions,
     RangeNoise,
     Ranging,
     Sensor,
@@ -30,22 +38,18 @@ from coloc_env.sensors import (
 
 def replay_miluv(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.1,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    prior_std: float = 0.5,
     process: Literal["inertial", "constant_velocity"] = "inertial",
-    accel_std: float = 0.2,
-    gyro_std: float = 0.005,
-    accel_bias: float = 0.1,
-    gyro_bias: float = 0.005,
-    slow_flight: float = 1.2,
-    range_std: float = 0.15,
-    height_std: float = 0.15,
-    velocity_accel_std: float = 0.6,
-    damping: float | None = 1.0,
+    accel_bias: Acceleration = 0.1,
+    gyro_bias: AngularRate = 0.005,
+    slow_flight: PositiveSpeed = 1.2,
+    range_std: Metres = 0.15,
+    height_std: Metres = 0.15,
+    velocity_accel_std: WhiteAcceleration = 0.6,
+    damping: PositiveSeconds | None = 1.0,
+    reward: Reward = "error",
+    replay: ReplayOptions = ReplayOptions(),
+    imu: ImuOptions = ImuOptions(accel_std=0.2, gyro_std=0.005),
+    prior: PriorOptions = PriorOptions(prior_std=0.5),
 ) -> Scenario:
     """Three UAVs for 77 s in a room with obstacles (MILUV): IMU, UWB to six anchors and between
     UAVs, laser height. Nothing is simulated but the prior's draw.
@@ -58,11 +62,11 @@ def replay_miluv(
     one part and score on another: the noise settings were chosen on all of it, and the result is
     flat around them.
     """
-    recording = loaded("miluv", sequence, data)
+    recording = replay.load("miluv")
     if process == "inertial" and "imu" not in recording.streams:
         raise ValueError(f"{recording.name} has no IMU: process=constant_velocity does without")
     drivers = ("imu",) if process == "inertial" else ()
-    grid = cut(common_grid(recording, dt, drivers), span)
+    grid = replay.cut(common_grid(recording, replay.dt, drivers))
     tags = lever_arms(recording)
     error = RangeNoise(std=range_std)
     anchors = AnchorRanging(tuple(map(tuple, recording.anchors.tolist())), error, tags)
@@ -78,9 +82,9 @@ def replay_miluv(
         believed.append(uwb)
     model: Process = ConstantVelocity(velocity_accel_std, damping)
     if process == "inertial":
-        imu = Imu(accel_std, gyro_std)
-        sensors.append(recorded_imu(recording, grid, imu, np.zeros((len(recording.robots), 6))))
-        believed += [imu, SlowFlight(slow_flight)]
+        no_bias = np.zeros((len(recording.robots), 6))
+        sensors.append(recorded_imu(recording, grid, imu.believed, no_bias))
+        believed += [imu.believed, SlowFlight(slow_flight)]
         model = Inertial(accel_bias, gyro_bias, accel_walk=0.01, gyro_walk=1e-4)
     return Scenario(
         name="replay-miluv-v0",
@@ -89,7 +93,7 @@ def replay_miluv(
         motion=recorded_motion(recording, grid),
         sensors=tuple(sensors),
         network=Network(),
-        prior=Prior(position_std=prior_std, velocity_std=0.1, attitude_std=0.06),
+        prior=prior.at_start(velocity_std=0.1, attitude_std=0.06),
         process=model,
         believed_sensors=tuple(believed),
         reward=reward,

@@ -10,8 +10,9 @@ from coloc_env.datasets.replay import (
     recorded_odometry,
 )
 from coloc_env.network import Network
-from coloc_env.scenario import Prior, Scenario, Wheeled
-from coloc_env.scenarios.replay import cut, loaded
+from coloc_env.options import AngularRate, Factor, Metres, Radians, Ratio, Seconds, Speed
+from coloc_env.scenario import PriorOptions, Reward, Scenario, Wheeled
+from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import (
     LandmarkBearings,
     Odometry,
@@ -21,19 +22,16 @@ from coloc_env.sensors import (
 
 def replay_mrclam(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.1,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    prior_std: float = 0.1,
-    forward_std: float = 0.03,
-    turn_std: float = 0.1,
-    odometry_relative: float = 0.2,
-    odometry_delay: float = 0.0,
-    odometry_scale: float = 1.0,
-    range_std: float = 0.2,
-    bearing_std: float = 0.04,
+    forward_std: Speed = 0.03,
+    turn_std: AngularRate = 0.1,
+    odometry_relative: Ratio = 0.2,
+    odometry_delay: Seconds = 0.0,
+    odometry_scale: Factor = 1.0,
+    range_std: Metres = 0.2,
+    bearing_std: Radians = 0.04,
+    reward: Reward = "error",
+    replay: ReplayOptions = ReplayOptions(),
+    prior: PriorOptions = PriorOptions(prior_std=0.1),
 ) -> Scenario:
     """Five ground robots for 756 s: odometry, range and bearing to 15 landmarks and to each other
     (UTIAS MRCLAM). Nothing is simulated but the prior's draw.
@@ -42,10 +40,8 @@ def replay_mrclam(
     ``odometry_scale=0.93`` correct what the first 250 s show of it. The noise settings are the
     team's belief, chosen on those 250 s.
     """
-    if odometry_delay < 0 or odometry_scale <= 0:
-        raise ValueError("odometry_delay is a time in s ≥ 0, odometry_scale a factor > 0")
-    recording = loaded("mrclam", sequence, data)
-    grid = cut(common_grid(recording, dt, ("odometry",)), span)
+    recording = replay.load("mrclam")
+    grid = replay.cut(common_grid(recording, replay.dt, ("odometry",)))
     odometry = Odometry(forward_std, 0.5 * forward_std, turn_std, odometry_relative)
     landmarks = LandmarkBearings(len(recording.landmarks), range_std, bearing_std)
     robots = UavBearings(range_std, bearing_std)
@@ -64,7 +60,7 @@ def replay_mrclam(
             replace(met, sensor=robots),
         ),
         network=Network(),
-        prior=Prior(position_std=prior_std, velocity_std=0.05, attitude_std=0.05),
+        prior=prior.at_start(velocity_std=0.05),
         process=Wheeled(),
         believed_sensors=(odometry, landmarks, robots),
         reward=reward,

@@ -16,10 +16,11 @@ from coloc_env.datasets.grid import Grid, common_grid
 from coloc_env.datasets.replay import arena_of, lever_arms, recorded_motion, recorded_ranges
 from coloc_env.geometry import Se3
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, Prior, Scenario
-from coloc_env.scenarios.replay import cut, loaded
+from coloc_env.options import Degrees, Metres, Seconds, Share
+from coloc_env.scenario import ConstantVelocity, Prior, Reward, Scenario
+from coloc_env.scenarios.parts.replays import RecordingOptions
 from coloc_env.sensors import Odometry, Ranging, RecordedPoses, Reference, RelativePose
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 _DT = 1.0  # s: the recording has one row a second
 _HEIGHT_STD, _TILT_STD = 0.1, 0.05  # m, rad: of what is believed of the agents' heights and tilts
@@ -90,14 +91,12 @@ def solved(recording: Recording, steps: int) -> Solved:
 
 def replay_murp(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    calibration: float = 60.0,
-    outliers: float = 0.0,
-    odometry_noise: tuple[float, float] = (0.02, 0.6),
-    relative_pose_noise: tuple[float, float] | None = None,
+    calibration: Seconds = 60.0,
+    outliers: Share = 0.0,
+    odometry_noise: tuple[Metres, Degrees] = (0.02, 0.6),
+    relative_pose_noise: tuple[Metres, Degrees] | None = None,
+    reward: Reward = "error",
+    replay: RecordingOptions = RecordingOptions(),
 ) -> Scenario:
     """Three agents with six UWB antennas each for some minutes, a step each second (MURP): at every
     step each ordered pair learns the relative pose that its 36 ranges say, by both ends.
@@ -111,7 +110,7 @@ def replay_murp(
     replaced by others, drawn uniformly from the area and all rotations. Poses are relative to agent
     0's, as in ``stein3d-v0``; the team believes all but the outliers.
     """
-    recording = loaded("murp", sequence, data)
+    recording = replay.load("murp")
     whole = common_grid(recording, _DT, ())
     if not 10.0 <= calibration <= (whole.count - 2) * _DT:
         raise ValueError(
@@ -119,16 +118,15 @@ def replay_murp(
         )
     steps = round(calibration / _DT)
     found = solved(recording, steps)
-    grid = cut(Grid(int(whole.times[steps]), _DT, whole.count - steps), span)
+    grid = replay.cut(Grid(int(whole.times[steps]), _DT, whole.count - steps))
     at = np.searchsorted(whole.times, grid.times)
     std, turn_std = found.std, found.turn_std
     if relative_pose_noise is not None:
         std, turn_std = relative_pose_noise[0], math.radians(relative_pose_noise[1])
-    slip, turn = odometry_noise[0] / _DT, math.radians(odometry_noise[1]) / _DT
-    odometry, reference = Odometry(slip, slip, turn), Reference()
+    odometry, reference = Odometry.of_steps(odometry_noise, _DT), Reference()
     matches = RelativePose(len(found.pairs), std, turn_std)
     drawn = RelativePose(len(found.pairs), std, turn_std, outliers)
-    measured = RecordedPoses(drawn, found.pairs, Tape(found.pose[at]), Tape(found.there[at]))
+    measured = RecordedPoses(drawn, found.pairs, Series(found.pose[at]), Series(found.there[at]))
     return Scenario(
         name="replay-murp-v0",
         arena=arena_of(recording, grid, margin=0.5),
@@ -140,7 +138,7 @@ def replay_murp(
         process=ConstantVelocity(accel_std=0.3),
         believed_sensors=(odometry, matches, reference),
         reward=reward,
-        guides=1,
+        anchor_uavs=1,
     )
 
 
@@ -150,7 +148,9 @@ def _ranges(recording: Recording, grid: Grid) -> tuple[Tensor, Tensor]:
     tags, robots = recording.tags.shape[1], len(recording.robots)
     if not (recording.tags == recording.tags[0]).all():
         raise DataError(f"{recording.name}: its agents carry different antennas")
-    tape = recorded_ranges(recording, grid, Ranging(tags=lever_arms(recording))).tape
+    recorded = recorded_ranges(recording, grid, Ranging(tags=lever_arms(recording))).series
     shape = (robots, tags, tags)
-    ranges, there = (tape[leaf].values.unflatten(-1, shape) for leaf in ("ranges", "range_mask"))
+    ranges, there = (
+        recorded[leaf].values.unflatten(-1, shape) for leaf in ("ranges", "range_mask")
+    )
     return ranges.double(), there > 0

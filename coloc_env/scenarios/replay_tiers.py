@@ -10,9 +10,10 @@ from coloc_env.datasets.grid import common_grid
 from coloc_env.datasets.recording import Floats
 from coloc_env.datasets.replay import arena_of, recorded_motion, recorded_ranges
 from coloc_env.network import Network
-from coloc_env.scenario import ConstantVelocity, InsDriven, Prior, Process, Scenario
-from coloc_env.scenarios.replay import cut, loaded
-from coloc_env.sensors import Ins, PositionFix, RangeNoise, Ranging, Sensor
+from coloc_env.options import Metres, PositiveCount, Seconds, WhiteAcceleration
+from coloc_env.scenario import ConstantVelocity, InsDriven, PriorOptions, Process, Reward, Scenario
+from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.sensors import InsOptions, PositionFix, RangeNoise, Ranging, Sensor
 
 
 def ordered(recording: Recording, order: list[int]) -> Recording:
@@ -65,66 +66,64 @@ def calibrated_pairs(recording: Recording, seconds: float) -> Recording:
 
 def replay_tiers(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.138,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    guides: tuple[int, ...] = (5, 1),
-    guide_std: float = 0.01,
-    prior_std: float = 0.5,
+    anchor_robots: tuple[PositiveCount, ...] = (5, 1),
+    anchor_std: Metres = 0.01,
     process: Literal["ins", "constant_velocity"] = "ins",
-    ins_std: float = 0.05,
-    ins_bias: float = 0.01,
-    ins_bias_time: float = 60.0,
-    velocity_accel_std: float = 0.1,
-    range_std: float = 0.2,
+    velocity_accel_std: WhiteAcceleration = 0.1,
+    range_std: Metres = 0.2,
     held: bool = False,
     calibrated: bool = True,
-    calibration: float = 60.0,
+    calibration: Seconds = 60.0,
+    reward: Reward = "error",
+    replay: ReplayOptions = ReplayOptions(dt=0.138),
+    ins: InsOptions = InsOptions(ins_std=0.05, ins_bias=0.01),
+    prior: PriorOptions = PriorOptions(prior_std=0.5),
 ) -> Scenario:
     """Four ground robots for 208 s within 5 m, three of which drive circles (TIERS, Turku): the six
-    ranges between them. Ranges and motion are real; velocities, guides' fixes and the prior's draw
-    are **simulated**.
+    ranges between them. Ranges and motion are real; velocities, fixes of the anchor robots and
+    the prior's draw are **simulated**.
 
-    The recording has no odometry. Each robot is told its velocity in the room's frame, the true one
-    with noise of ``ins_std`` m/s a step and a bias of ``ins_bias`` m/s that lasts ``ins_bias_time``
-    s, about a tenth of the 0.15 to 0.2 m/s that they drive: a wheeled robot's odometry with a
-    compass. ``process="constant_velocity"`` does without: velocity driven by
+    The recording has no odometry. Each robot has its velocity in the room's frame, the true one
+    with noise and bias, about a tenth of the 0.15 to 0.2 m/s that they drive: a wheeled robot's
+    odometry with a compass. ``process="constant_velocity"`` does without: velocity driven by
     ``velocity_accel_std``.
 
-    ``guides``: numbers of the robots that know where they are (to ``guide_std`` m per axis, also
-    simulated), come first and are not scored. Ranges alone never tell where a team is, how it is
-    turned and which of two mirror images it is. Two guides, robot 5, which stands still, and
+    ``anchor_robots``: numbers of the robots that know where they are (to ``anchor_std`` m per axis,
+    also simulated), come first and are not scored. Ranges alone never show where a team is, how it
+    is turned and which of two mirror images it is. Two anchors, robot 5, which stands still, and
     another, settle the first two; the last is settled by the prior, and by robots with known
-    velocities that drive curves. With one guide the turn, too, shows only in how robots move, and
+    velocities that drive curves. With one anchor the turn, too, shows only in how robots move, and
     range errors of this recording's kind, which last, hide it (on its first 60 s the joint EKF is
-    off by 0.50 m RMS with one guide, by 0.13 with two). With three guides one place
+    off by 0.50 m RMS with one anchor, by 0.13 with two). With three anchors one place
     fits best, but methods with a prior that is metres off may settle on the other side of them.
 
     ``calibrated``: each pair's ranges are made shorter by their median error in the recording's
-    first ``calibration`` s, by OptiTrack, whatever ``span`` is flown; not ``calibrated``, they are
-    0.19 to 0.49 m too long. ``held``: ranges that repeat the one before are delivered too.
+    first ``calibration`` s, by OptiTrack, whatever ``span`` is replayed; not ``calibrated``, they
+    are 0.19 to 0.49 m too long. ``held``: ranges that repeat the one before are delivered too.
     Calibration and ``range_std`` were chosen on the first 60 s: ``span=60:208`` is what nothing was
     fitted on.
     """
-    recording = loaded("tiers", sequence, data, held=held)
+    recording = replay.load("tiers", held=held)
     known = [int(robot.removeprefix("turtle")) for robot in recording.robots]
-    if len(set(guides)) < len(guides) or not set(guides) < set(known):
+    distinct = len(set(anchor_robots)) == len(anchor_robots)
+    if not (distinct and set(anchor_robots) < set(known)):
         raise ValueError(
-            f"guides={guides} is not allowed: some, not all, of {', '.join(map(str, known))}"
+            f"anchor_robots={anchor_robots} is not allowed: some, not all, of "
+            f"{', '.join(map(str, known))}"
         )
     if calibrated:
         recording = calibrated_pairs(recording, calibration)
-    first = [known.index(guide) for guide in guides]
+    first = [known.index(robot) for robot in anchor_robots]
     rest = [robot for robot in range(len(known)) if robot not in first]
     recording = ordered(recording, first + rest)
-    grid = cut(common_grid(recording, dt, ()), span)
-    own: tuple[Sensor, ...] = (PositionFix(guide_std, len(guides)),) if guides else ()
+    grid = replay.cut(common_grid(recording, replay.dt, ()))
+    own: tuple[Sensor, ...] = ()
+    if anchor_robots:
+        own = (PositionFix(anchor_std, len(anchor_robots)),)
     model: Process = ConstantVelocity(velocity_accel_std)
     if process == "ins":
         model = InsDriven()
-        own = (Ins(ins_std, ins_bias, ins_bias_time), *own)
+        own = (ins.sensor, *own)
     ranging = Ranging(RangeNoise(std=range_std))
     return Scenario(
         name="replay-tiers-v0",
@@ -133,9 +132,9 @@ def replay_tiers(
         motion=recorded_motion(recording, grid),
         sensors=(*own, recorded_ranges(recording, grid, ranging)),
         network=Network(),
-        prior=Prior(position_std=prior_std, velocity_std=0.1, attitude_std=0.1),
+        prior=prior.at_start(velocity_std=0.1, attitude_std=0.1),
         process=model,
         believed_sensors=(*own, ranging),
         reward=reward,
-        guides=len(guides),
+        anchor_uavs=len(anchor_robots),
     )

@@ -2,28 +2,24 @@
 
 from typing import Literal
 
-from coloc_env.scenario import ConstantVelocity, Prior, Process, Scenario, Wheeled
-from coloc_env.scenarios.replay import loaded
-from coloc_env.scenarios.replay_anchors import anchor_scenario, corrected, ranging_grid
+from coloc_env.options import AngularRate, Coordinate, Metres, Speed, WhiteAcceleration
+from coloc_env.scenario import ConstantVelocity, PriorOptions, Process, Reward, Scenario, Wheeled
+from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.scenarios.parts.tag_replays import anchor_scenario, corrected, ranging_grid
 from coloc_env.sensors import Odometry
 
 
 def replay_tuc(
     *,
-    sequence: str | None = None,
-    data: str | None = None,
-    dt: float = 0.128,
-    span: tuple[float, float] | None = None,
-    reward: str = "error",
-    prior_std: float = 0.5,
-    prior: str = "gaussian",
-    max_speed: float = 0.5,
     process: Literal["wheeled", "constant_velocity"] = "wheeled",
-    range_std: float = 0.15,
-    range_bias: float = 0.11,
-    velocity_accel_std: float = 0.5,
-    forward_std: float = 0.05,
-    turn_std: float = 0.2,
+    range_std: Metres = 0.15,
+    range_bias: Coordinate = 0.11,
+    velocity_accel_std: WhiteAcceleration = 0.5,
+    forward_std: Speed = 0.05,
+    turn_std: AngularRate = 0.2,
+    reward: Reward = "error",
+    replay: ReplayOptions = ReplayOptions(dt=0.128),
+    prior: PriorOptions = PriorOptions(prior_std=0.5, max_speed=0.5),
 ) -> Scenario:
     """A wheeled robot for 30 s in a square of 2.4 m among four anchors (TU Chemnitz "Labyrinth"):
     odometry and one range a step. Nothing is simulated but the prior's draw.
@@ -35,13 +31,13 @@ def replay_tuc(
     the steps: from 23 s on a range is delivered 0.08 s, from 25 s on 0.05 s after it was measured,
     and a few of the last steps have no truth near enough to be scored.
     """
-    recording = corrected(loaded("tuc", sequence, data), 0.0, range_bias)
-    grid = ranging_grid(recording, dt, span, margin=0.001)
+    recording = corrected(replay.load("tuc"), 0.0, range_bias)
+    grid = ranging_grid(recording, replay, margin=0.001)
     model: Process = ConstantVelocity(velocity_accel_std)
     odometry = None
     if process == "wheeled":
         model, odometry = Wheeled(), Odometry(forward_std, 0.5 * forward_std, turn_std)
-    told = Prior(prior_std, 0.1, 0.2, prior, max_speed if prior == "uniform" else None)
+    start = prior.at_start(0.1, 0.2)
     return anchor_scenario(
-        "replay-tuc-v0", recording, grid, told, model, range_std, reward, odometry
+        "replay-tuc-v0", recording, grid, start, model, range_std, reward, odometry
     )

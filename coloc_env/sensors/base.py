@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.motion import Arena, Kinematics
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 MASK = (0.0, 1.0)
 
@@ -72,7 +72,10 @@ class Sensor(ABC):
     """
 
     informs: ClassVar[bool] = True
-    """Whether its leaves tell of where UAVs are (a frame that estimates are stated in does not)."""
+    """Whether it is a measurement (the frame that estimates are stated in is none)."""
+
+    between_uavs: ClassVar[bool] = False
+    """Whether it ties UAVs together (as a range between two does, a range to an anchor not)."""
 
     @property
     def delay(self) -> int:
@@ -118,14 +121,14 @@ class Sensor(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded(Sensor):
-    """A sensor whose samples come from a recording: step k delivers ``tape[leaf][k]``.
+class RecordedSensor(Sensor):
+    """A sensor whose samples come from a recording: step k delivers ``series[leaf][k]``.
 
-    ``sensor`` describes the leaves; each tape is float32 [T, N, F]; maps are [F].
+    ``sensor`` describes the leaves; each series is float32 [T, N, F]; maps are [F].
     """
 
     sensor: Sensor
-    tape: dict[str, Tape]
+    series: dict[str, Series]
     maps: dict[str, Tensor] = field(default_factory=dict)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
@@ -144,7 +147,7 @@ class Recorded(Sensor):
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         alive = window.alive.unsqueeze(-1)
-        return {name: tape.at(window.steps) * alive for name, tape in self.tape.items()}
+        return {name: values.at(window.steps) * alive for name, values in self.series.items()}
 
 
 def require(condition: bool, owner: Any, name: str, allowed: str) -> None:

@@ -93,6 +93,8 @@ class UavBearings(Sensor):
     """Leaves ``uav_bearings`` [D · S · 2] and ``uav_bearing_mask`` [D · S]: range (m) and bearing
     (rad) to each neighbour slot, each end measuring for itself."""
 
+    between_uavs = True
+
     range_std: float = 0.15
     bearing_std: float = 0.02
     share: float = 1.0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float32, Int64
@@ -9,7 +10,8 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotation_between, unrotate
-from coloc_env.sensors.base import Layout, Leaf, Recorded, Sensor, Window, require
+from coloc_env.options import Acceleration, AngularRate, Group
+from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window, require
 
 GRAVITY = 9.80665  # m/s², along -z of the world
 
@@ -65,12 +67,52 @@ class Imu(Sensor):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedImu(Recorded):
+class RecordedImu(RecordedSensor):
     """A recorded ``Imu`` that also has leaves ``imu_samples`` [S · 6] and ``imu_held`` [S]: each
     sample in the step that ends now, as it was measured, and for how long it holds (s; 0 where
     there is none). ``accel_std`` and ``gyro_std`` are those of the mean, as ever."""
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        width = self.tape["imu_held"].values.shape[-1]
+        width = self.series["imu_held"].values.shape[-1]
         whole = {"imu_samples": Leaf(6 * width), "imu_held": Leaf(width, 0.0)}
         return super().leaves(layout) | whole
+
+
+@dataclass(frozen=True)
+class ImuOptions(Group):
+    """``accel_std`` and ``gyro_std``: white noise of one sample (the mean over a step)."""
+
+    title: ClassVar[str] = "IMU"
+
+    accel_std: Acceleration = 0.05
+    gyro_std: AngularRate = 0.01
+
+    @property
+    def believed(self) -> Imu:
+        """The sensor as the team believes it to be: its biases, if any, are states."""
+        return Imu(self.accel_std, self.gyro_std)
+
+
+@dataclass(frozen=True)
+class SimulatedImuOptions(ImuOptions):
+    """With ``imu_bias``, each UAV's sensors have constant biases of standard deviations
+    ``accel_bias`` and ``gyro_bias``; ``believed_imu_bias``: whether the team estimates biases
+    (none: if there are any). ``imu=false`` leaves the IMU out, and a constant-velocity model."""
+
+    imu: bool = True
+    imu_bias: bool = False
+    accel_bias: Acceleration = 0.1
+    gyro_bias: AngularRate = 0.01
+    believed_imu_bias: bool | None = None
+
+    @property
+    def true(self) -> Imu:
+        """The sensor as it is."""
+        if not self.imu_bias:
+            return self.believed
+        return Imu(self.accel_std, self.gyro_std, self.accel_bias, self.gyro_bias)
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the team estimates biases."""
+        return self.imu_bias if self.believed_imu_bias is None else self.believed_imu_bias

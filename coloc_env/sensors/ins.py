@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.options import Group, PositiveSeconds, Speed
 from coloc_env.sensors.base import Layout, Leaf, Sensor, Window, require
 
 _COSINES = 32  # in the sum that makes a bias: its excess kurtosis is −1.5 over their number
@@ -63,8 +65,8 @@ class Ins(Sensor):
         ins = white.mul_(self.std).add_(clean)
         if placed:
             ins.add_(self._biases(window, placed))
-        begun = window.alive & (window.steps > 0).unsqueeze(-1)
-        return {"ins": ins.mul_(begun.unsqueeze(-1))}
+        moved = window.alive & (window.steps > 0).unsqueeze(-1)
+        return {"ins": ins.mul_(moved.unsqueeze(-1))}
 
     def _biases(self, window: Window, placed: dict[str, Tensor]) -> Float32[Tensor, "R K N d"]:
         """The biases at the window's steps."""
@@ -75,3 +77,20 @@ class Ins(Sensor):
             angle = (steps * turn.unsqueeze(1)).add_(phase.unsqueeze(1))
             total = total + angle.cos_()
         return total * (self.bias * (2 / _COSINES) ** 0.5)
+
+
+@dataclass(frozen=True)
+class InsOptions(Group):
+    """The INS measures the velocity with white noise of ``ins_std`` m/s per axis and step and a
+    bias of ``ins_bias`` m/s that wanders over ``ins_bias_time`` s; the team knows both."""
+
+    title: ClassVar[str] = "INS"
+
+    ins_std: Speed = 0.5
+    ins_bias: Speed = 0.3
+    ins_bias_time: PositiveSeconds = 60.0
+
+    @property
+    def sensor(self) -> Ins:
+        """The sensor, as it is and as the team believes."""
+        return Ins(self.ins_std, self.ins_bias, self.ins_bias_time)

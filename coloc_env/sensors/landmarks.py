@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotate, rotation_matrix
+from coloc_env.options import Count, Group, Metres, PositiveMetres, Seconds, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
 
 
@@ -122,3 +124,36 @@ class Landmarks(Sensor):
                 value.addcmul_(rotation[..., row, column, None], apart[row])
             seen[..., column].add_(value).mul_(visible)
         return {"landmarks": seen.flatten(-2), "landmark_mask": visible}
+
+
+@dataclass(frozen=True)
+class LandmarkOptions(Group):
+    """So many ``landmarks`` stand anywhere in the arena; those within ``landmark_radius`` m are
+    seen as position vectors with noise of ``landmark_std`` m per axis. A share ``false_matches`` of
+    these belongs to another landmark, a share ``landmark_dropout`` is missing, and in the times
+    ``range_only`` (from, to) none is seen. The team believes the Gaussian part alone.
+    """
+
+    title: ClassVar[str] = "landmarks"
+
+    landmarks: Count = 20
+    landmark_std: Metres = 0.15
+    landmark_radius: PositiveMetres = 10.0
+    false_matches: Share = 0.0
+    landmark_dropout: Share = 0.0
+    range_only: tuple[Seconds, Seconds] | None = None
+
+    @property
+    def true(self) -> tuple[Landmarks, ...]:
+        """The sensor as it is; nothing without landmarks."""
+        return self._seen(self.false_matches, self.landmark_dropout, self.range_only)
+
+    @property
+    def believed(self) -> tuple[Landmarks, ...]:
+        """The sensor that the team believes in; nothing without landmarks."""
+        return self._seen()
+
+    def _seen(self, *wrong: Any) -> tuple[Landmarks, ...]:
+        if not self.landmarks:
+            return ()
+        return (Landmarks(self.landmarks, self.landmark_std, self.landmark_radius, *wrong),)

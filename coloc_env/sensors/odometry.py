@@ -1,7 +1,9 @@
 """Odometry: what a vehicle moved and turned over a step, by its wheels or by its cameras."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from jaxtyping import Float32
@@ -31,6 +33,12 @@ class Odometry(Sensor):
     def __post_init__(self) -> None:
         for name in ("forward_std", "left_std", "turn_std", "relative"):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
+
+    @classmethod
+    def of_steps(cls, noise: tuple[float, float], dt: float) -> Self:
+        """With noise in m (each way) and degrees of the motion over steps of ``dt`` s."""
+        slip = noise[0] / dt
+        return cls(slip, slip, math.radians(noise[1]) / dt)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return {"odometry": Leaf(6 if layout.arena.dim == 3 else 3)}

@@ -1,11 +1,13 @@
 """Fixes of a UAV's own position, as satellite navigation gives them."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.options import Group, Metres, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
 
 
@@ -34,3 +36,23 @@ class PositionFix(Sensor):
             "position_fix": (position + self.std * white) * mask,
             "position_fix_mask": mask,
         }
+
+
+@dataclass(frozen=True)
+class AnchorUavOptions(Group):
+    """A share ``anchor_share`` of the UAVs, the first ones, know where they are, to ``anchor_std``
+    m per axis, and are not scored."""
+
+    title: ClassVar[str] = "anchor UAVs"
+
+    anchor_share: Share = 0.15
+    anchor_std: Metres = 0.1
+
+    def count(self, n_uavs: int) -> int:
+        """How many of a team they are."""
+        return round(self.anchor_share * n_uavs)
+
+    def fixes(self, n_uavs: int) -> tuple[PositionFix, ...]:
+        """What tells them where they are; nothing if there are none."""
+        count = self.count(n_uavs)
+        return (PositionFix(self.anchor_std, count),) if count else ()

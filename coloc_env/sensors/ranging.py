@@ -11,6 +11,7 @@ from coloc_env import noise
 from coloc_env.geometry import rotate
 from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box, Kinematics
+from coloc_env.options import Count
 from coloc_env.sensors.base import (
     MASK,
     Layout,
@@ -22,7 +23,7 @@ from coloc_env.sensors.base import (
     squared_norm,
 )
 from coloc_env.sensors.errors.clock import Clock
-from coloc_env.sensors.errors.range_noise import RangeNoise
+from coloc_env.sensors.errors.range_noise import RangeNoise, RangeOptions
 
 Tags = tuple[tuple[tuple[float, ...], ...], ...]
 
@@ -62,6 +63,8 @@ class Ranging(Sensor):
     has the noise's NLOS bias and is too long by ``excess`` times the metres inside. ``clock``: the
     systematic errors of each pair (None: none).
     """
+
+    between_uavs = True
 
     noise: RangeNoise = field(default_factory=RangeNoise)
     tags: Tags = ()
@@ -121,6 +124,13 @@ class Ranging(Sensor):
             mask = mask & ~lost
         mask = mask.to(torch.float32)
         return {"ranges": (ranges * mask).flatten(-3), "range_mask": mask.flatten(-3)}
+
+
+@dataclass(frozen=True)
+class UavRangeOptions(RangeOptions):
+    """Ranges between UAVs arrive ``uwb_delay`` steps after they were measured."""
+
+    uwb_delay: Count = 0
 
 
 @dataclass(frozen=True)

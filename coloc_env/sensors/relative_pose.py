@@ -1,7 +1,8 @@
 """Relative poses between UAVs, as matches of what their cameras see give them: some are wrong."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -10,8 +11,9 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.geometry import poses_in, rotate_by
 from coloc_env.motion import Arena
+from coloc_env.options import Degrees, Group, Metres, PositiveCount, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 
 @dataclass(frozen=True)
@@ -19,12 +21,14 @@ class RelativePose(Sensor):
     """Leaves ``relative_poses`` [M · P], ``relative_pose_mask`` [M] and ``relative_pose_ends``
     [M · 2]: at each step M = ``matches`` ordered pairs (i, j) of UAVs are drawn, each alike, and
     UAVs i and j both learn the pose of j in the body frame of i: position (m), then quaternion
-    wxyz (P = 7) or heading in rad (P = 3). ``relative_pose_ends`` says i and j.
+    wxyz (P = 7) or heading in rad (P = 3). ``relative_pose_ends``: i and j.
 
     Position noise has ``std`` m per axis, rotation noise ``turn_std`` rad per body axis. With
     probability ``outliers`` a match is wrong: it shows j at a pose drawn uniformly from the arena
     and from all rotations. A pair whose link does not reach learns nothing.
     """
+
+    between_uavs = True
 
     matches: int = 1
     std: float = 0.05
@@ -88,10 +92,12 @@ class RecordedPoses(Sensor):
     of what is recorded.
     """
 
+    between_uavs = True
+
     sensor: RelativePose
     pairs: tuple[tuple[int, int], ...]
-    poses: Tape
-    there: Tape
+    poses: Series
+    there: Series
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return self.sensor.leaves(layout)
@@ -108,13 +114,38 @@ class RecordedPoses(Sensor):
         return _leaves(first, second, pose, held)
 
 
+@dataclass(frozen=True)
+class RelativePoseOptions(Group):
+    """In each step ``matches_per_step`` random pairs of UAVs measure their relative pose, with
+    standard deviations ``relative_pose_noise`` in m and degrees. A share ``outliers`` of these is
+    wrong, uniform over the arena and all rotations; the team believes all of them.
+    """
+
+    title: ClassVar[str] = "relative poses"
+
+    matches_per_step: PositiveCount = 1
+    relative_pose_noise: tuple[Metres, Degrees] = (0.05, 2.0)
+    outliers: Share = 0.2
+
+    @property
+    def true(self) -> RelativePose:
+        """The sensor as it is."""
+        return replace(self.believed, outliers=self.outliers)
+
+    @property
+    def believed(self) -> RelativePose:
+        """The sensor that the team believes in."""
+        std, turn_std = self.relative_pose_noise
+        return RelativePose(self.matches_per_step, std, math.radians(turn_std))
+
+
 def _leaves(
     first: Int64[Tensor, "R K M"],
     second: Int64[Tensor, "R K M"],
     pose: Float32[Tensor, "R K M P"],
     held: Bool[Tensor, "R K N M"],
 ) -> dict[str, Tensor]:
-    """What each UAV is told of the matches: those that it holds."""
+    """The leaves of each UAV: the matches that it holds."""
     ends = torch.stack((first, second), -1).unsqueeze(2) * held.unsqueeze(-1)
     return {
         "relative_poses": (pose.unsqueeze(2) * held.unsqueeze(-1)).flatten(-2),

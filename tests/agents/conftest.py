@@ -74,10 +74,16 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "imu_bias": indoor(imu_bias=True),
     "anchors": indoor(imu=False, landmarks=0, anchors=8),
     "slots": indoor(n_uavs=20),
+    "ranges": indoor(landmarks=0, nlos=0.3),
+    "many": indoor(landmarks=0, n_uavs=20),
+    "sight": indoor(uwb=False),
+    "sight_few": indoor(uwb=False, landmarks=4),
+    "sight_uniform": indoor(uwb=False, prior="uniform"),
+    "sight_bias": indoor(uwb=False, imu_bias=True, n_uavs=20),
     "plane": plane,
     "tags": tags,
-    "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, dropout=0.2),
-    "swarm": lambda: make_scenario("swarm-v0", n_uavs=8, anchors=0.4, nlos_time=3.0),
+    "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, uwb_dropout=0.2),
+    "swarm": lambda: make_scenario("swarm-v0", n_uavs=8, anchor_share=0.4, nlos_time=3.0),
     "campus": lambda: make_scenario("campus-v0", flight="s3", dt=0.5),
     "stein2d": lambda: make_scenario("stein2d-v0", matches_per_step=2),
     "stein3d": lambda: make_scenario("stein3d-v0", n_uavs=4),
@@ -97,21 +103,22 @@ VARIANTS = (
 )
 REFUSED = {("ekf_joint", "slots")}
 TWINS = ("pf", "pf800", "ippo", "sb3-ppo")  # of pf500 and mappo, but for what is set here
-# Those that need anchors, or take their time over many landmarks.
+# Where those are tested that do not serve everything, or take their time over many landmarks.
 CHOSEN = {
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "tags", "wsn"),
     "nnhpff": ("anchors", "tags", "wsn"),
-    **dict.fromkeys(("dwmds_st", "map"), ("nlos", "anchors", "slots", "swarm", "campus", "tags")),
-    "mds": ("nlos", "slots", "tags"),  # among few, one that fails moves the map by a metre
-    **dict.fromkeys(("dwmds", "vmds"), ("nlos", "anchors", "slots", "tags")),
-    **dict.fromkeys(("fcmds", "gn"), ("anchors", "slots", "tags")),
-    "stdcl": ("anchors", "slots", "swarm", "campus"),
-    "stgat": ("slots", "swarm"),
+    **dict.fromkeys(("dwmds_st", "map"), ("ranges", "anchors", "many", "swarm", "campus", "tags")),
+    "mds": ("ranges", "many", "tags"),  # among few, one that fails moves the map by a metre
+    **dict.fromkeys(("dwmds", "vmds"), ("ranges", "anchors", "many", "tags")),
+    **dict.fromkeys(("fcmds", "gn"), ("anchors", "many", "tags")),
+    "stdcl": ("swarm", "campus"),
+    "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
-    "stein_vi": ("default", "few", "uniform", "imu_bias", "slots"),
+    "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
-SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d")
+SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
+SPECIAL = (*SPECIAL, "sight", "sight_few", "sight_uniform", "sight_bias")
 ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE) if n not in TWINS),
@@ -119,7 +126,7 @@ CASES = [
     *((n, "wsn") for n in ("pf", "ekf")),
     *((n, "swarm") for n in ("dead_reckoning", "ekf", "ekf_joint", "pf", "ekf:robust=huber")),
     ("dead_reckoning", "campus"),
-    *((n, "stein2d") for n in ("dead_reckoning", "ekf")),
+    ("dead_reckoning", "stein2d"),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
     *((n, "default") for n in TWINS),
@@ -168,12 +175,16 @@ def build(name: str, scenario: Scenario) -> Localizer:
 
 
 def room(name: str, **overrides: Any) -> Scenario:
-    """``indoor-v0``; for those that need anchors, among anchors alone; ``stein2d-v0`` for those
-    that need relative poses."""
-    if "stein2d" in CHOSEN.get(name, ()):
+    """``indoor-v0`` with what a localizer serves: among anchors alone, or without UWB;
+    ``stein2d-v0`` and ``swarm-v0`` for those that serve nothing else."""
+    chosen = CHOSEN.get(name, ("default",))
+    if "stein2d" in chosen:
         return make_scenario("stein2d-v0", **overrides)
-    anchored = "default" not in CHOSEN.get(name, ("default",))
-    among: dict[str, Any] = {"anchors": 8, "landmarks": 0} if anchored else {}
+    if name in ("stdcl", "stgat"):
+        return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
+    if "sight" in chosen:
+        return make_scenario("indoor-v0", uwb=False, **overrides)
+    among: dict[str, Any] = {} if "default" in chosen else {"anchors": 8, "landmarks": 0}
     return make_scenario("indoor-v0", **among, **overrides)
 
 

@@ -55,7 +55,7 @@ class Offsets(Measurement):
 def linear(monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace) -> SimpleNamespace:
     """The linear world, of whose measurements all filters have these models."""
     models = [tools.linear.fixes, Offsets()]
-    for module in ("ekf", "ekf_joint", "pf"):
+    for module in ("kalman.ekf", "kalman.ekf_joint", "particle.filter"):
         monkeypatch.setattr(f"agents.{module}.make_measurements", lambda _: models)
     return tools.linear
 

@@ -1,6 +1,7 @@
 """Making localizers by name: what is there, and one clear line for what is not."""
 
-from collections.abc import Callable
+import importlib
+import inspect
 from types import SimpleNamespace
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from agents import LOCALIZERS, Localizer, make
 from agents.kalman.ekf import CooperativeEkf
 from agents.robust import RobustScreen
+from coloc_env.registry import Registry
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.scenarios import make_scenario
 
@@ -18,16 +20,14 @@ def scenario() -> Scenario:
 
 
 @pytest.mark.parametrize("name", LOCALIZERS)
-def test_every_name_makes_a_localizer_from_beliefs_alone(
-    name: str, scenario: Scenario, tools: SimpleNamespace
-) -> None:
-    needs_poses = tools.room(name).name == "stein2d-v0"
-    scenario = tools.room(name) if needs_poses else scenario
+def test_every_name_makes_a_localizer_from_beliefs_alone(name: str, tools: SimpleNamespace) -> None:
+    scenario = tools.room(name)
     localizer = make(name, scenario)
     assert isinstance(localizer, Localizer)
     assert localizer.believed is scenario.believed
     assert all(
-        option.default is not option.empty for option in LOCALIZERS.options_of(name).values()
+        option.default is not inspect.Parameter.empty
+        for option in LOCALIZERS.options_of(name).values()
     )
 
 
@@ -133,18 +133,51 @@ def test_a_scenario_that_does_not_suit_is_refused_when_made(case: str) -> None:
         make(name, scenario)
 
 
-def test_register_adds_a_name(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> None:
-    monkeypatch.setattr("agents.localizer.LOCALIZERS", dict(LOCALIZERS))
-    from agents import localizer
-
-    @register("half")
+def test_register_adds_a_name(scenario: Scenario) -> None:
+    @LOCALIZERS.register("half")
     def half(believed: Believed, *, share: float = 0.5) -> Localizer:
+        """Half a filter."""
         if share > 1:
             raise ValueError("more than all")
         return CooperativeEkf(believed)
 
-    made: Callable[..., Localizer] = localizer.make
-    assert isinstance(made("half:share=0.25", scenario), CooperativeEkf)
-    with pytest.raises(ValueError, match=r"^half: more than all$"):
-        made("half:share=2", scenario)
+    try:
+        assert "half" in list(LOCALIZERS)
+        assert LOCALIZERS.summary("half") == "Half a filter."
+        assert isinstance(make("half:share=0.25", scenario), CooperativeEkf)
+        with pytest.raises(ValueError, match=r"^half: more than all$"):
+            make("half:share=2", scenario)
+    finally:
+        LOCALIZERS.remove("half")
     assert "half" not in LOCALIZERS
+
+
+def test_a_built_in_name_stays(scenario: Scenario) -> None:
+    with pytest.raises(ValueError, match="agent 'ekf' exists already"):
+        LOCALIZERS.register("ekf")
+
+
+@pytest.mark.parametrize("name", LOCALIZERS)
+def test_summaries_are_those_of_the_docstrings(name: str) -> None:
+    """Read from the source, before anything is imported."""
+    module, _, attribute = LOCALIZERS._references[name].partition(":")
+    doc = getattr(importlib.import_module(module), attribute).__doc__
+    assert Registry("agent", "none", {name: f"{module}:{attribute}"}).summary(name) in (
+        " ".join(doc.replace("``", "").split())
+    )
+
+
+IGNORED = {  # a localizer, a scenario, and what it would ignore of it
+    "stdcl indoors": ("stdcl", "indoor-v0", {}, "Landmarks"),
+    "map indoors": ("map", "indoor-v0", {}, "Landmarks"),
+    "dwmds_st indoors": ("dwmds_st", "indoor-v0", {}, "Landmarks"),
+    "ekf among relative poses": ("ekf", "stein2d-v0", {}, "RelativePose"),
+    "cspf in a swarm": ("cspf", "swarm-v0", {}, "PositionFix, Ranging"),
+}
+
+
+@pytest.mark.parametrize("case", IGNORED)
+def test_a_localizer_refuses_to_ignore_what_is_measured(case: str) -> None:
+    name, scenario, overrides, sensors = IGNORED[case]
+    with pytest.raises(ValueError, match=rf"^{name}: .*{sensors} would be ignored; these use it: "):
+        make(name, make_scenario(scenario, **overrides))

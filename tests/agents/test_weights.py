@@ -1,6 +1,8 @@
 """Checkpoints: what is written is read back, and whatever is wrong with one is said in a line."""
 
+import hashlib
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -8,9 +10,12 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from agents import make
 from agents.particle.corrector import WeightCorrector
-from agents.weights import Learned, load, shipped
-from training.learning.checkpoints import write
+from agents.stdcl.network import StGnn
+from agents.weights import Learned, learned, load, shipped, write
+from coloc_env.scenarios import make_scenario
+from training.evaluation.evaluate import split_agents
 
 
 class Other(Learned):
@@ -63,9 +68,16 @@ def test_weights_come_back(corrector: WeightCorrector, file: Path, ending: str) 
     weight = other.hidden.weight
     card = load(file.parent / ending, other)
     assert card["command"] == "none"
-    assert other.hidden.weight is weight, "in place: a filter that flies with it sees the change"
+    assert other.hidden.weight is weight, "in place: a filter that uses it sees the change"
     for name, value in corrector.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
+
+
+def test_figures_that_do_not_apply_are_null(corrector: WeightCorrector, file: Path) -> None:
+    write(file, corrector, {"metrics": {"a": float("nan"), "b": 1.5}, "scores": {"c": [1e999]}})
+    card = load(file, corrector)
+    assert card["metrics"] == {"a": None, "b": 1.5}
+    assert card["scores"] == {"c": [None]}
 
 
 def test_every_shipped_checkpoint_says_how_it_was_trained() -> None:
@@ -133,8 +145,6 @@ def test_a_pickle_is_not_opened(file: Path, corrector: WeightCorrector) -> None:
     torch.save(corrector.state_dict(), file)
     assert "damaged" in refused(file, corrector)
     card = json.loads(file.with_suffix(".json").read_text())
-    import hashlib
-
     card["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
     file.with_suffix(".json").write_text(json.dumps(card))
     assert "not a safetensors file" in refused(file, corrector)
@@ -149,3 +159,96 @@ def test_nothing_half_written(
     save_file({"a": torch.zeros(1)}, file.parent / "b.safetensors")
     (file.parent / "b.safetensors").unlink()
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before
+
+
+# ---------------------------------------------------------------- doors
+
+
+def test_a_byte_order_mark_is_read_over(file: Path) -> None:
+    card = file.with_suffix(".json")
+    card.write_bytes(b"\xef\xbb\xbf" + card.read_bytes())
+    load(file, WeightCorrector())
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("features", ["dx", 1], "'features' is ['dx', 1], a list of names is needed"),
+        ("epochs", 0, "'epochs' is 0, a whole number ≥ 1 is needed"),
+        ("epochs", True, "'epochs' is True, a whole number ≥ 1 is needed"),
+        ("metrics", {"rmse": "0.1"}, "'metrics' is {'rmse': '0.1'}, an object, each of its values"),
+        ("metrics", {"rmse": float("nan")}, "is not JSON: NaN is not a finite number"),
+        ("architecture", {"width": 3}, "has an architecture that no pfnn has: 'width'"),
+    ],
+)
+def test_a_card_with_a_wrong_field(file: Path, key: str, value: object, words: str) -> None:
+    card = file.with_suffix(".json")
+    card.write_text(json.dumps(json.loads(card.read_text()) | {key: value}))
+    with pytest.raises(ValueError, match=r".") as error:
+        learned(WeightCorrector, file)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("value", [0, -1, 10**9, 64.0, True, "64", None, [], 10**400])
+def test_an_architecture_of_another_size_is_refused_before_it_fills_the_memory(
+    value: object, tmp_path: Path
+) -> None:
+    file = tmp_path / "net.safetensors"
+    write(file, StGnn(width=8), {})
+    assert learned(StGnn, file).architecture["width"] == 8
+    card = json.loads(file.with_suffix(".json").read_text())
+    card["architecture"]["width"] = value
+    file.with_suffix(".json").write_text(json.dumps(card))
+    with pytest.raises(ValueError, match=r"net.safetensors") as error:
+        learned(StGnn, file)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["mappo", "stdcl", "pfnn"])
+def test_damaged_cards(name: str, tmp_path: Path, damaged: Callable[..., Iterator[bytes]]) -> None:
+    """One line, or the same weights as before: where what was damaged is not of the network."""
+    root = Path(__file__).parents[2] / "checkpoints"
+    file, card = tmp_path / f"{name}.safetensors", tmp_path / f"{name}.json"
+    file.write_bytes((root / file.name).read_bytes())
+    text = (root / card.name).read_text()
+    whole, scenario = json.loads(text), make_scenario(SCENARIOS_OF[name])
+    whole.get("architecture", {}).get("mode", {}).pop("feedback", None)
+    of_network = ("kind", "features", "sha256", "architecture")
+    lines = []
+    for data in damaged(text, 0, 150):
+        card.write_bytes(data)
+        try:
+            make(name, scenario, weights=str(file))
+        except (ValueError, OSError) as error:
+            lines.append(str(error))
+        else:
+            found = json.loads(data.decode("utf-8-sig"))
+            if name == "mappo":  # any share of feedback is as good as another
+                assert 0 <= found["architecture"]["mode"].pop("feedback") <= 1
+            assert all(found.get(key) == whole.get(key) for key in of_network)
+    assert len(lines) > 75
+    assert not any("\n" in line for line in lines)
+    assert all(line.encode() for line in lines)
+
+
+SCENARIOS_OF = {"mappo": "indoor-v0", "stdcl": "swarm-v0", "pfnn": "indoor-v0"}
+
+
+def test_paths_with_colons_commas_and_home(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = make_scenario("indoor-v0", n_uavs=2)
+    folder = tmp_path / "a:b, c~d"
+    folder.mkdir()
+    for end in (".safetensors", ".json"):
+        (folder / f"my,net:1{end}").write_bytes(file.with_suffix(end).read_bytes())
+    make(f"pfnn:weights={folder}/my,net:1.safetensors:correction=0.1,0.9", scenario)
+    agent = f"pfnn:weights={folder}/my,net:1.safetensors:correction=0.1,0.9"
+    names = ["ekf", agent, "apf:bounds=1,8", "ekf:robust=huber"]
+    assert split_agents(",".join(names)) == names
+    monkeypatch.setenv("HOME", str(tmp_path))
+    load("~/mine.safetensors", WeightCorrector())
+    make("pfnn:weights=~/mine.safetensors", scenario)
+    assert "there is no such home directory" in refused(
+        "~nobody-here/a.safetensors", WeightCorrector()
+    )

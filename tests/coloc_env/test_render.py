@@ -55,7 +55,7 @@ def test_every_kind_of_scene_is_drawn(overrides, steps):
 
 
 def test_guides_are_drawn_where_they_are_and_count_for_nothing():
-    world = World(make_scenario("swarm-v0", n_uavs=8, anchors=0.4))
+    world = World(make_scenario("swarm-v0", n_uavs=8, anchor_share=0.4))
     world.reset(0)
     snapshot = take(world, torch.zeros(1, 8, 9))
     assert np.array_equal(snapshot.position, world.truth.position[0].numpy())

@@ -16,7 +16,8 @@ from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, ConstantVelocity, Prior, Scenario
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.record import RunRecord, Worlds
+from training.evaluation.results import Evaluation
 
 
 class Belief(TensorClass["nocast"]):
@@ -80,8 +81,8 @@ class Still(Localizer[Belief]):
         return {"particles": belief.step + 99.0, "calm": calm, "steps_per_run": calm}
 
 
-def _arrays(dim: int) -> Results:
-    """Results of two agents without a simulation; the second is hopeless."""
+def _arrays(dim: int) -> Evaluation:
+    """Evaluation of two agents without a simulation; the second is hopeless."""
     rng = np.random.default_rng(0)
     runs, steps, n_uavs = 2, 30, 3
     arena = Arena(dim, n_uavs, 0.1, (0.0,) * dim, (10.0,) * dim)
@@ -99,37 +100,32 @@ def _arrays(dim: int) -> Results:
         believed_sensors=(),
         overrides={"room": (10.0, 10.0), "walls": None},
     )
-    agents = {}
-    for name, scale in offsets.items():
-        offset = rng.normal(scale=scale, size=(*shape, dim)).astype(np.float32)
-        agents[name] = AgentResult(
-            offset=offset,
-            error=np.linalg.norm(offset, axis=-1),
-            nees=(offset**2).sum(-1) / np.float32(0.01),
-            broken=np.zeros(runs, bool),
-            raised=0,
-            message=None,
-            series={},
-            ms_per_step=1.5,
-        )
+    offset_of = {
+        name: rng.normal(scale=scale, size=(*shape, dim)).astype(np.float32)
+        for name, scale in offsets.items()
+    }
     scored = np.ones(shape, bool)
     scored[0, 5:8] = False  # a gap in a recording
     scored[:, 20:, 0] = False  # a failed UAV
     attitude = rng.normal(size=(steps, n_uavs, 4 if dim == 3 else 1))
     attitude /= np.linalg.norm(attitude, axis=-1, keepdims=True) if dim == 3 else 1
-    return Results(
-        scenario=scenario,
-        seed=7,
-        truth=rng.uniform(0, 10, size=(*shape, dim)),
-        attitude=attitude,
-        scored=scored,
-        bound=None,
-        agents=agents,
-    )
+    worlds = Worlds(7, rng.uniform(0, 10, size=(*shape, dim)), attitude, scored)
+    agents = {
+        name: RunRecord(
+            worlds,
+            offset,
+            error=np.linalg.norm(offset, axis=-1),
+            nees=(offset**2).sum(-1) / np.float32(0.01),
+            broken=np.zeros(runs, bool),
+            ms_per_step=1.5,
+        )
+        for name, offset in offset_of.items()
+    }
+    return Evaluation(scenario, worlds, None, agents)
 
 
 @pytest.fixture(params=[2, 3])
-def made_up(request: pytest.FixtureRequest) -> Results:
+def made_up(request: pytest.FixtureRequest) -> Evaluation:
     """Made-up results in two and three dimensions."""
     return _arrays(request.param)
 
@@ -138,9 +134,9 @@ def made_up(request: pytest.FixtureRequest) -> Results:
 def localizers() -> Iterator[None]:
     """Registers ``test_still``, and takes it away again."""
     torch.set_num_threads(1)
-    LOCALIZERS["test_still"] = Still
+    LOCALIZERS.register("test_still")(Still)
     yield
-    del LOCALIZERS["test_still"]
+    LOCALIZERS.remove("test_still")
 
 
 @pytest.fixture

@@ -87,7 +87,7 @@ def _trained(name: str, base: str) -> Callable[[], Timed]:
 
         def run(steps: int) -> None:
             for _ in range(steps // HORIZON):
-                training.flights.epoch = 0
+                training.collector.epoch = 0
                 training.trainer.train()
 
         return Timed(run, HORIZON)

@@ -11,18 +11,18 @@ import torch
 
 from agents import Localizer
 from coloc_env.scenario import Scenario
-from coloc_env.world import World
+from training.evaluation.rollout import rollout
 
-PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pfnn_trust")
+PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pf_trust")
 REST = "rest"
 _STEPS, _WARM_UP = 200, 20
 _FUNCTIONS = {  # where a name is looked up: what its time is called
-    "agents.particle.pf.normal": "noise",
+    "agents.particle.filter.normal": "noise",
     "agents.particle.resampling.normal": "noise",
     "agents.particle.proposal.normal": "noise",
     "agents.particle.tempering.normal": "noise",
-    "agents.particle.pf.heard": "messages",
-    "agents.particle.pf.log_likelihood": "likelihood",
+    "agents.particle.filter.heard": "messages",
+    "agents.particle.filter.log_likelihood": "likelihood",
     "agents.particle.resampling.moments": "moments",
     "agents.particle.proposal.moments": "moments",
     "agents.particle.tempering.moments": "moments",
@@ -34,10 +34,10 @@ _FUNCTIONS = {  # where a name is looked up: what its time is called
     "agents.particle.tempering.normalized": "weights",
     "agents.particle.tempering.effective_sample_size": "weights",
     "agents.particle.proposal.iterated_update": "Gaussian update",
-    "agents.particle.pf.proposed": "proposal",
+    "agents.particle.filter.proposed": "proposal",
     "agents.particle.degeneracy.proposed": "proposal",
     "agents.kalman.ekf.heard": "messages",
-    "agents.kalman.ekf.predict": "prediction",
+    "agents.kalman.filter.predict": "prediction",
     "agents.models.update.information": "information",
     "agents.models.update.posterior": "information",
     "agents.trust.screen.innovation": "trust features",
@@ -77,20 +77,16 @@ class Stopwatch:
         return call
 
 
-@torch.no_grad()
 def step_parts(localizer: Localizer, scenario: Scenario) -> dict[str, float]:
     """Mean ms of each part of the whole team's step in one world; ``rest`` is what no part is."""
-    world, watch = World(scenario), Stopwatch()
-    observation = world.reset(0)
-    belief = localizer.reset(observation)
-    step = watch.watched(REST, localizer.step)
-    with _watching(localizer, watch):
-        for k in range(_WARM_UP + _STEPS):
-            if k == _WARM_UP:
+    watch = Stopwatch()
+    with (
+        _watching(localizer, watch),
+        patch.object(localizer, "step", watch.watched(REST, localizer.step)),
+    ):
+        for step in rollout(localizer, scenario, torch.tensor([0]), _WARM_UP + _STEPS):
+            if step.k == _WARM_UP - 1:
                 watch.seconds.clear()
-            belief, estimate = step(belief, observation)
-            world.advance(estimate.action())
-            observation = world.observation()
     ordered = sorted(watch.seconds.items(), key=lambda item: (item[0] == REST, -item[1]))
     return {part: 1e3 * seconds / _STEPS for part, seconds in ordered}
 

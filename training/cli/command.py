@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 from training.cli.reproduce import reproduce
 from training.cli.terminal import explain, progress, show
 from training.cli.train import train
+from training.threads import use_threads
 
 if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
@@ -124,8 +125,9 @@ def evaluate(
     columns = {key: title for key, title in files.COLUMNS.items() if key not in _TOO_WIDE}
     show(["", *columns.values()], files.rows(found, columns))
     for name, one in found.agents.items():
-        if one.raised:
-            what = f"{name} raised in {one.raised} of {found.runs} runs; first at {one.message}"
+        if one.messages:
+            count = f"{len(one.messages)} of {found.runs} runs"
+            what = f"{name} raised in {count}; first at {one.messages[0]}"
             typer.echo(f"warning: {what}", err=True)
     typer.echo(f"written to {out}")
 
@@ -181,8 +183,8 @@ def render(
 
     built = _scenario(scenario, settings, threads, data)
     from coloc_env.render import frame_to_png, save_animation
+    from training.evaluation.animation import frames
     from training.evaluation.evaluate import make
-    from training.evaluation.rollout import frames
 
     suffix = out.suffix.lower()
     if suffix not in (".gif", ".png"):
@@ -220,17 +222,13 @@ app.command()(reproduce)
 
 def _scenario(name: str, settings: list[str] | None, threads: int, data: Path | None) -> "Scenario":
     """Prepare the process, and build a scenario from a command line."""
-    if threads < 1:
-        raise ValueError(f"--threads {threads} is not allowed: at least 1")
+    use_threads(threads)
     if data is not None:
         os.environ["COLOC_DATA"] = str(data)
     from dataclasses import replace
 
-    import torch
-
     from coloc_env.scenarios import make_scenario, parse_override
 
-    torch.set_num_threads(threads)
     overrides = dict(parse_override(name, text) for text in settings or ())
     return replace(make_scenario(name, **overrides), overrides=overrides)
 

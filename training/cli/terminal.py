@@ -19,22 +19,26 @@ _PIPED = 160  # columns of a table that no terminal shows
 
 def explain(name: str, registry: Registry, kind: str) -> None:
     """Print what a registered name is by its docstring, and its options (each a ``kind``, a
-    singular noun) in groups, with units, what is allowed, and defaults."""
+    singular noun) in groups: what each may be, with its unit, and its default."""
     from training.evaluation.results import typed
 
     known = registry.options_of(name)
     text = "\n\n".join(map(escape, paragraphs(inspect.getdoc(registry[name]) or "")))
-    Console().print(f"[bold]{escape(name)}[/bold]\n{text}\n", highlight=False)
+    console = Console()
+    console.print(f"[bold]{escape(name)}[/bold]\n{text}", highlight=False)
     if not known:
-        typer.echo(f"no {kind}s")
-    groups = dict.fromkeys(option.group for option in known.values())
+        typer.echo(f"\nno {kind}s")
+    groups = {option.group: option.about for option in known.values()}
+    width = max(map(len, known), default=0)
     for group in sorted(groups, key=bool):  # those of the function itself first
+        about = f"\n{escape(groups[group])}" if groups[group] else ""
+        console.print(f"\n[bold]{group or f'{kind}s'}[/bold]{about}", highlight=False)
         lines = [
-            [option.name, option.words, typed(option.default)]
+            [option.name.ljust(width), option.words, typed(option.default)]
             for option in known.values()
             if option.group == group
         ]
-        show([group or kind, "allowed", "default"], lines)
+        show(["", "allowed", "default"], lines)
 
 
 def show(header: list[str], lines: list[list[str]]) -> None:

@@ -1,13 +1,13 @@
 """``coloc train``."""
 
 import logging
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from training.cli.terminal import explain, progress, show
+from training.threads import use_threads
 
 
 def train(
@@ -54,24 +54,17 @@ def train(
 
     tensorboard --logdir runs
     """
-    if threads < 1:
-        raise ValueError(f"--threads {threads} is not allowed: at least 1")
-    # MKL's products of matrices would else depend, in their last digits, on where in memory they
-    # lie, and so would the weights. It has to be said before MKL is first used.
-    os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
-    import torch
-
-    torch.set_num_threads(threads)
+    use_threads(threads)
     from coloc_env.options import parse
     from training.learning import run
     from training.learning.registry import TRAININGS
 
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer it makes
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every buffer it makes
     if resume is not None:
         if name is not None or out is not None or settings:
             raise ValueError("--resume goes alone: a run continues as it was started")
-        with progress() as tell:
-            weights = run.resume(resume, tell)
+        with progress() as bars:
+            weights = run.resume(resume, bars)
     elif name is None:
         show(["training", ""], [[key, TRAININGS.summary(key)] for key in TRAININGS])
         typer.echo("coloc train TRAINING lists its options.")
@@ -84,6 +77,6 @@ def train(
     else:
         known = TRAININGS.options_of(name)
         chosen = dict(parse(name, text, known) for text in settings or ())
-        with progress() as tell:
-            weights = run.start(name, chosen, out, tell)
+        with progress() as bars:
+            weights = run.start(name, chosen, out, bars)
     typer.echo(f"weights written to {weights}")

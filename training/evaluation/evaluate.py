@@ -1,21 +1,26 @@
 """Evaluation: every agent meets the same worlds, batched over runs, and nothing is ever dropped."""
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
-import agents as _agents  # noqa: F401  (registers the localizers)
 from agents.localizer import Localizer
 from agents.registry import make
 from coloc_env.bounds import Bound, posterior_bound
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
-from training.evaluation.results import AgentResult, Results
-from training.evaluation.rollout import NUMERICAL, Tape, play
+from training.evaluation.record import RunRecord, record
+from training.evaluation.results import Evaluation
+from training.evaluation.rollout import NUMERICAL, Breakdown, rollout
 
 Progress = Callable[[str, int, int], None]
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """Progress that is reported to nobody."""
+
 
 _FAST = 2**25  # bytes of a batch's beliefs and what is made of them in a step: more fits no cache
 _WORKING_SET = 20  # bytes in use at the height of a step per byte of belief
@@ -27,11 +32,11 @@ def evaluate(
     agents: Sequence[str],
     runs: int = 20,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     *,
     bound: bool = True,
     chunk: int | None = None,
-) -> Results:
+) -> Evaluation:
     """Run agents (names with options, ``"ekf:robust=huber"``) on the worlds of seeds ``seed`` …
     ``seed + runs − 1``.
 
@@ -44,40 +49,22 @@ def evaluate(
     """
     _check(agents, runs, seed, chunk)
     team = {name: make(name, scenario) for name in agents}
-    tell = progress or (lambda what, done, total: None)
-    known = _bound(scenario, runs, seed, tell) if bound else None
-    results: dict[str, AgentResult] = {}
-    tape = None
+    known = _bound(scenario, runs, seed, progress) if bound else None
+    records: dict[str, RunRecord] = {}
     for name, localizer in team.items():
-        tape = _runs(name, localizer, scenario, runs, seed, chunk, tell)
-        results[name] = AgentResult(
-            offset=tape.offset.numpy(),
-            error=tape.error.numpy(),
-            nees=tape.nees.numpy(),
-            broken=tape.broken.numpy(),
-            raised=len(tape.raised),
-            message=tape.raised[0] if tape.raised else None,
-            series={key: value.numpy() for key, value in tape.series.items()},
-            ms_per_step=ms_per_step(localizer, scenario, seed),
-        )
-    assert tape is not None
-    return Results(
-        scenario=scenario,
-        seed=seed,
-        truth=tape.truth.numpy(),
-        attitude=tape.attitude[0].numpy(),
-        scored=tape.scored.numpy(),
-        bound=known,
-        agents=results,
-    )
+        found = _runs(name, localizer, scenario, runs, seed, chunk, progress)
+        records[name] = replace(found, ms_per_step=ms_per_step(localizer, scenario, seed))
+    return Evaluation(scenario, next(iter(records.values())).worlds, known, records)
 
 
 def split_agents(text: str) -> list[str]:
     """Agents of a list with commas; a piece that starts with a digit, sign or point belongs to the
-    option before (``apf:bounds=100,800``)."""
+    option before (``apf:bounds=100,800``), and so does a piece of a path (``weights=a,b/c``)."""
     names: list[str] = []
     for piece in text.split(","):
-        if names and piece[:1] in set("0123456789+-."):
+        head = piece.partition("=")[0]
+        path = "/" in head or ".safetensors" in head
+        if names and (path or piece[:1] in set("0123456789+-.")):
             names[-1] += f",{piece}"
         elif piece.strip():
             names.append(piece.strip())
@@ -98,14 +85,14 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
         raise ValueError(f"chunk={chunk} is not allowed: at least 1")
 
 
-def _bound(scenario: Scenario, runs: int, seed: int, tell: Progress) -> Bound | None:
+def _bound(scenario: Scenario, runs: int, seed: int, progress: Progress) -> Bound | None:
     """The posterior bound over the same worlds; None for a scenario that it does not cover."""
-    tell("bound", 0, 1)
+    progress("bound", 0, 1)
     try:
         known = posterior_bound(scenario, runs=runs, seed=seed)
     except (ValueError, NotImplementedError, torch.linalg.LinAlgError):
         known = None
-    tell("bound", 1, 1)
+    progress("bound", 1, 1)
     return known
 
 
@@ -116,8 +103,8 @@ def _runs(
     runs: int,
     seed: int,
     chunk: int | None,
-    tell: Progress,
-) -> Tape:
+    progress: Progress,
+) -> RunRecord:
     """All runs of one agent, as many at once as are fast together."""
     at_once = chunk or _runs_at_once(localizer, scenario)
     done, total = 0, runs * scenario.horizon
@@ -125,10 +112,10 @@ def _runs(
     def tick(steps: int) -> None:
         nonlocal done
         done += steps
-        tell(name, done, total)
+        progress(name, done, total)
 
     seeds = torch.arange(seed, seed + runs)
-    return Tape.cat([play(localizer, scenario, part, tick) for part in seeds.split(at_once)])
+    return RunRecord.cat([record(localizer, scenario, part, tick) for part in seeds.split(at_once)])
 
 
 # ------------------------------------------------------------------ cost
@@ -143,24 +130,17 @@ def _runs_at_once(localizer: Localizer, scenario: Scenario) -> int:
     return max(1, _FAST // (_WORKING_SET * max(1, size)))
 
 
-@torch.no_grad()
 def ms_per_step(localizer: Localizer, scenario: Scenario, seed: int) -> float | None:
     """Median time in ms of the whole team's step, one world, one thread; None if it raises."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    world = World(scenario)
     times: list[float] = []
+    seeds = torch.tensor([seed])
     try:
         while len(times) < _WARM_UP + _TIMED:
-            observation = world.reset(seed)
-            belief = localizer.reset(observation)
-            for _ in range(min(scenario.horizon, _WARM_UP + _TIMED - len(times))):
-                start = time.perf_counter()
-                belief, estimate = localizer.step(belief, observation)
-                times.append(time.perf_counter() - start)
-                world.advance(estimate.action())
-                observation = world.observation()
-    except NUMERICAL:
+            steps = min(scenario.horizon, _WARM_UP + _TIMED - len(times))
+            times += [step.seconds for step in rollout(localizer, scenario, seeds, steps)]
+    except Breakdown:
         return None
     finally:
         torch.set_num_threads(threads)

@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 from coloc_env.render.style import GRID, INK, MUTED, uav_colours
 from training.evaluation import metrics
 from training.evaluation.metrics import Flags, Floats
-from training.evaluation.results import FIGURES, Results
+from training.evaluation.results import FIGURES, Evaluation
 
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -47,9 +47,9 @@ _SHOWN = 100.0  # s of a run that a picture of trajectories shows at most
 _IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
 
 
-def draw(results: Results, folder: Path) -> None:
+def draw(results: Evaluation, folder: Path) -> None:
     """Write all figures into a folder."""
-    drawings: Sequence[Callable[[Results], Figure]] = (
+    drawings: Sequence[Callable[[Evaluation], Figure]] = (
         error_over_time,
         error_distribution,
         error_boxes,
@@ -64,15 +64,15 @@ def draw(results: Results, folder: Path) -> None:
             figure.savefig(folder / name, dpi=150, bbox_inches=page)
 
 
-def error_over_time(results: Results) -> Figure:
+def error_over_time(results: Evaluation) -> Figure:
     """RMS error over runs and UAVs at each step, with the middle half of the errors."""
     note = "line: root mean square over runs and UAVs; shade: middle half of the errors"
     figure, axes = _figure(results, "Position error over time", note)
     time = _time(results)
     for name, look in _looks(results).items():
         error = results.agents[name].error
-        axes.plot(time, metrics.rmse_per_step(error, results.scored), **look)
-        half = _quantiles_per_step(error, results.scored, (0.25, 0.75))
+        axes.plot(time, metrics.rmse_per_step(error, results.worlds.scored), **look)
+        half = _quantiles_per_step(error, results.worlds.scored, (0.25, 0.75))
         axes.fill_between(time, *half, color=look["color"], alpha=0.12, linewidth=0)
     if results.bound is not None:
         bound = results.bound.mse.numpy() ** 0.5
@@ -84,12 +84,12 @@ def error_over_time(results: Results) -> Figure:
     return figure
 
 
-def error_distribution(results: Results) -> Figure:
+def error_distribution(results: Evaluation) -> Figure:
     """Share of all errors below a value."""
     figure, axes = _figure(results, "Distribution of position errors", "all steps, UAVs and runs")
     share = np.concatenate(([1e-3], np.linspace(0.005, 0.995, 397), [0.999, 1]))
     for name, look in _looks(results).items():
-        errors = results.agents[name].error[results.scored]
+        errors = results.agents[name].error[results.worlds.scored]
         if errors.size:
             axes.plot(np.quantile(errors, share), 100 * share, **look)
     _mark_bound(axes, results)
@@ -100,7 +100,7 @@ def error_distribution(results: Results) -> Figure:
     return figure
 
 
-def error_boxes(results: Results) -> Figure:
+def error_boxes(results: Evaluation) -> Figure:
     """RMSE of each UAV in each run: quartiles, 5 % to 95 % whiskers, every one as a dot."""
     count, limit = len(results.agents), _farthest(results)
     note = "box: quartiles; whiskers: 5 % to 95 %; dots: every UAV and run"
@@ -108,7 +108,7 @@ def error_boxes(results: Results) -> Figure:
     figure, axes = _figure(results, "RMSE of each UAV in each run", note, 1.7 + 0.5 * count)
     jitter = np.random.default_rng(0)
     for row, (name, look) in enumerate(_looks(results).items()):
-        tracks = metrics.rmse_per_track(results.agents[name].error, results.scored)
+        tracks = metrics.rmse_per_track(results.agents[name].error, results.worlds.scored)
         tracks, line = tracks[np.isfinite(tracks)], {"color": look["color"]}
         if not tracks.size:
             continue
@@ -140,7 +140,7 @@ def error_boxes(results: Results) -> Figure:
     return figure
 
 
-def consistency(results: Results) -> Figure:
+def consistency(results: Evaluation) -> Figure:
     """Mean NEES at each step with the band in which a consistent estimator's lies."""
     dim = results.scenario.arena.dim
     note = f"mean over runs and UAVs; {dim} is consistent (shade: 95 %), more is overconfident"
@@ -148,8 +148,8 @@ def consistency(results: Results) -> Figure:
     time = _time(results)
     for name, look in _looks(results).items():
         look["linewidth"] *= 0.6
-        axes.plot(time, _mean_per_step(results.agents[name].nees, results.scored), **look)
-    counts = results.scored.sum((0, 2)).tolist()
+        axes.plot(time, _mean_per_step(results.agents[name].nees, results.worlds.scored), **look)
+    counts = results.worlds.scored.sum((0, 2)).tolist()
     bands = {n: metrics.nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts)}
     low, high = np.array([bands[n] for n in counts]).T
     axes.fill_between(time, low, high, color=MUTED, alpha=0.25, linewidth=0, zorder=0)
@@ -161,15 +161,15 @@ def consistency(results: Results) -> Figure:
     return figure
 
 
-def trajectories(results: Results) -> Figure:
+def trajectories(results: Evaluation) -> Figure:
     """Truth and estimates in the last 100 s of the first run: plan, and height over time."""
     deep = results.scenario.arena.dim == 3
     last = slice(-round(_SHOWN / results.dt), None)
     figure = Figure(figsize=(10.5 if deep else 6.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2 if deep else 1, squeeze=False)[0]
-    shown = results.scored[0, last][..., None]
-    truth = np.where(shown, results.truth[0, last], np.nan)
+    shown = results.worlds.scored[0, last][..., None]
+    truth = np.where(shown, results.worlds.truth[0, last], np.nan)
     tracks = [(truth, _TRUTH)]
     for name, look in _looks(results).items():
         tracks.append((truth + results.agents[name].offset[0, last], look | {"linewidth": 1.0}))
@@ -197,7 +197,7 @@ def trajectories(results: Results) -> Figure:
 # ------------------------------------------------------------------ parts
 
 
-def _figure(results: Results, title: str, note: str, height: float = 4.5) -> tuple[Figure, Axes]:
+def _figure(results: Evaluation, title: str, note: str, height: float = 4.5) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(7.5, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -206,7 +206,7 @@ def _figure(results: Results, title: str, note: str, height: float = 4.5) -> tup
     return figure, axes
 
 
-def _looks(results: Results) -> dict[str, dict[str, Any]]:
+def _looks(results: Evaluation) -> dict[str, dict[str, Any]]:
     """One colour per agent, the same in all figures; later lines are thinner, so that lines that
     coincide can all be seen."""
     names = list(results.agents)
@@ -219,7 +219,7 @@ def _looks(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def _legend(
-    figure: Figure, results: Results, handles: Sequence[Line2D] = (), bound: bool = True
+    figure: Figure, results: Evaluation, handles: Sequence[Line2D] = (), bound: bool = True
 ) -> None:
     """Agents, and the bound, below the axes."""
     looks = _looks(results).items()
@@ -231,7 +231,7 @@ def _legend(
     figure.legend(handles=lines, loc="outside lower center", ncols=columns)
 
 
-def _mark_bound(axes: Axes, results: Results) -> None:
+def _mark_bound(axes: Axes, results: Evaluation) -> None:
     if results.bound is not None:
         axes.axvline(results.bound.rmse, **BOUND)
 
@@ -259,15 +259,15 @@ def _cut(
         set_limits(low, highest)
 
 
-def _farthest(results: Results) -> float:
+def _farthest(results: Evaluation) -> float:
     """Errors beyond this (m) leave the figure: the arena's diagonal, or more if all are so bad."""
     arena = results.scenario.arena
     diagonal = float(np.linalg.norm(np.subtract(arena.high, arena.low)))
-    errors = [metrics.rmse(one.error, results.scored) for one in results.agents.values()]
+    errors = [metrics.rmse(one.error, results.worlds.scored) for one in results.agents.values()]
     return max(diagonal, 2 * min(errors)) if np.isfinite(errors).all() else diagonal
 
 
-def _time(results: Results) -> Floats:
+def _time(results: Evaluation) -> Floats:
     return np.arange(results.scenario.horizon) * results.dt
 
 
@@ -275,7 +275,7 @@ def _span(time: Floats, dt: float) -> tuple[float, float]:
     return float(time[0]), max(float(time[-1]), dt)
 
 
-def _which(results: Results, shown: int) -> str:
+def _which(results: Evaluation, shown: int) -> str:
     return f", {shown} of {n} UAVs" if (n := results.scenario.arena.n_uavs) > shown else ""
 
 

@@ -17,6 +17,7 @@ from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Flags, Floats
+from training.evaluation.record import RunRecord, Worlds
 
 FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
 NAMES = ("results.csv", "table.md", *FIGURES, "tum", "results.json")
@@ -43,44 +44,22 @@ team, one world, one thread."""
 
 
 @dataclass(frozen=True, eq=False)
-class AgentResult:
-    """What an agent did in R runs of K steps with N UAVs.
-
-    ``offset`` p̂ − p [R, K, N, d] and ``error`` its length [R, K, N], m; ``nees`` [R, K, N] of the
-    position, NaN where the covariance is not positive definite; ``broken`` [R]: runs with NaN,
-    infinity or a numerical error, ``raised`` of them with the latter, ``message`` the first;
-    ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
-    run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1.
-    """
-
-    offset: Floats
-    error: Floats
-    nees: Floats
-    broken: Flags
-    raised: int
-    message: str | None
-    series: dict[str, Floats]
-    ms_per_step: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class Results:
-    """All agents on the same R worlds, seeded ``seed`` … ``seed`` + R − 1.
-
-    ``truth`` [R, K, N, d] m; ``attitude`` [K, N, a] of the first run; ``scored`` [R, K, N].
-    """
+class Evaluation:
+    """All agents' runs in the same worlds, and the bound of those worlds (None: none is known)."""
 
     scenario: Scenario
-    seed: int
-    truth: Floats
-    attitude: Floats
-    scored: Flags
+    worlds: Worlds
     bound: Bound | None
-    agents: dict[str, AgentResult]
+    agents: dict[str, RunRecord]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the first world."""
+        return self.worlds.seed
 
     @property
     def runs(self) -> int:
-        return len(self.truth)
+        return len(self.worlds.truth)
 
     @property
     def dt(self) -> float:
@@ -100,18 +79,20 @@ class Results:
         if self.scenario.reference is None:
             return None
         seeds = torch.arange(self.seed, self.seed + self.runs)
-        _, steps, n_uavs, dim = self.truth.shape
+        _, steps, n_uavs, dim = self.worlds.truth.shape
         return self.scenario.reference.errors(seeds, steps, n_uavs, dim, self.dt)
 
     def diverged(self, agent: str) -> Flags:
         """[R]: runs in which a UAV ends lost or an estimate was not finite."""
         one = self.agents[agent]
-        lost = metrics.lost(one.error, self.scored, self.dt, self.lost_beyond)
+        lost = metrics.lost(one.error, self.worlds.scored, self.dt, self.lost_beyond)
         return one.broken | lost.any(1)
 
     def paired_difference(self, a: str, b: str) -> Difference:
         """RMSE of agent ``a`` minus that of ``b``, run by run: mean and 95 % interval, m."""
-        first, second = (metrics.rmse_per_run(self.agents[x].error, self.scored) for x in (a, b))
+        first, second = (
+            metrics.rmse_per_run(self.agents[x].error, self.worlds.scored) for x in (a, b)
+        )
         return metrics.paired_difference(first, second)
 
     @cached_property
@@ -129,7 +110,7 @@ class Results:
         }
 
     def _figures(self, agent: str) -> dict[str, Any]:
-        one, scored = self.agents[agent], self.scored
+        one, scored = self.agents[agent], self.worlds.scored
         errors, per_run = one.error[scored], metrics.rmse_per_run(one.error, scored)
         per_run = per_run[np.isfinite(per_run)]
         rmse = metrics.rmse(one.error, scored)
@@ -158,7 +139,7 @@ class Results:
         return {key: plain(value) for key, value in figures.items()}
 
     def _diagnostics(self, agent: str) -> dict[str, float]:
-        one, scored, dim = self.agents[agent], self.scored, self.scenario.arena.dim
+        one, scored, dim = self.agents[agent], self.worlds.scored, self.scenario.arena.dim
         errors = one.error[scored]
         low, high = metrics.nees_band(dim, max(1, int(scored.any(1).sum())))
         figures = {
@@ -170,7 +151,7 @@ class Results:
         }
         if self.scenario.arena.n_uavs > 1:
             figures["relative_error"] = metrics.relative_error(one.offset, scored)
-            figures["fge"] = metrics.formation_error(self.truth, one.offset, scored)
+            figures["fge"] = metrics.formation_error(self.worlds.truth, one.offset, scored)
         if self.scenario.network.radius is not None:
             figures["nrmse"] = metrics.rmse(one.error, scored) / self.scenario.network.radius
         if self.reference is not None:
@@ -178,13 +159,13 @@ class Results:
             error = np.linalg.norm(apart, axis=-1)
             figures["ate_reference"] = metrics.ate(error, scored)
             if self.scenario.arena.n_uavs > 1:
-                standing = self.truth + self.reference
+                standing = self.worlds.truth + self.reference
                 figures["fge_reference"] = metrics.formation_error(standing, apart, scored)
         undefined = float(np.isnan(one.nees[scored]).mean()) if errors.size else 0.0
         if undefined:
             figures["nees_undefined_share"] = undefined
-        if one.raised:
-            figures["raised_runs"] = one.raised
+        if one.messages:
+            figures["raised_runs"] = len(one.messages)
         return figures
 
 
@@ -206,7 +187,7 @@ def plain(value: Any) -> Any:
 # ------------------------------------------------------------------ tables and files
 
 
-def rows(results: Results, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
+def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     """The main table as text: one line for the bound, if known, and one per agent."""
     keys = tuple(keys)
     bound, lines = results.bound, []
@@ -218,7 +199,7 @@ def rows(results: Results, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     return lines
 
 
-def markdown(results: Results) -> str:
+def markdown(results: Evaluation) -> str:
     """The main table, paired differences to the first agent, and what the words mean."""
     names, dim = list(results.agents), results.scenario.arena.dim
     what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
@@ -234,9 +215,9 @@ def markdown(results: Results) -> str:
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
         text += table(["agent", "mean difference", "95 % interval"], differences)
     for name, one in results.agents.items():
-        if one.raised:
-            how_many = f"{one.raised} of {results.runs} runs"
-            text += ["", f"`{name}` raised in {how_many}; the first at {one.message}"]
+        if one.messages:
+            how_many = f"{len(one.messages)} of {results.runs} runs"
+            text += ["", f"`{name}` raised in {how_many}; the first at {one.messages[0]}"]
     return "\n".join(text) + "\n"
 
 
@@ -247,7 +228,7 @@ def typed(value: Any) -> str:
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
-def csv_text(results: Results) -> str:
+def csv_text(results: Evaluation) -> str:
     """One line per agent; empty where a figure does not apply."""
     lines = []
     for name, figures in results.summary["agents"].items():
@@ -262,7 +243,7 @@ def csv_text(results: Results) -> str:
     return out.getvalue()
 
 
-def write(results: Results, folder: Path, figures: bool = True) -> None:
+def write(results: Evaluation, folder: Path, figures: bool = True) -> None:
     """Write everything into an empty folder (a staged one: ``coloc_env.staging``)."""
     from training.evaluation.tum import write_tum
 
@@ -277,7 +258,7 @@ def write(results: Results, folder: Path, figures: bool = True) -> None:
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _interval(results: Results, a: str, b: str) -> list[str]:
+def _interval(results: Evaluation, a: str, b: str) -> list[str]:
     difference = results.paired_difference(a, b)
     return [signed(difference.mean), f"{signed(difference.low)} to {signed(difference.high)}"]
 

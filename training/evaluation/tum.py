@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from training.evaluation.metrics import Floats
-from training.evaluation.results import Results
+from training.evaluation.results import Evaluation
 
 
-def write_tum(results: Results, folder: Path) -> None:
+def write_tum(results: Evaluation, folder: Path) -> None:
     """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only."""
     time = np.arange(results.scenario.horizon) * results.dt
-    attitude = quaternions(results.attitude)
+    attitude = quaternions(results.worlds.attitude)
     identity = np.broadcast_to((0.0, 0.0, 0.0, 1.0), attitude.shape)
-    tracks = {"groundtruth": (results.truth[0], attitude)}
+    tracks = {"groundtruth": (results.worlds.truth[0], attitude)}
     for name, label in zip(results.agents, folder_names(list(results.agents)), strict=True):
-        tracks[label] = (results.truth[0] + results.agents[name].offset[0], identity)
+        tracks[label] = (results.worlds.truth[0] + results.agents[name].offset[0], identity)
     for label, (position, turned) in tracks.items():
         (folder / label).mkdir(parents=True)
         for i, uav in enumerate(results.scenario.agents):
-            now = results.scored[0, :, i]
+            now = results.worlds.scored[0, :, i]
             text = tum_text(time[now], position[now, i], turned[now, i])
             (folder / label / f"{uav}.txt").write_text(text, encoding="ascii")
 

@@ -81,8 +81,9 @@ class CoLocTask(TaskClass):
 def mean_error(policy: Any, settings: dict[str, Any]) -> float:
     """Mean error (m) of the best actions in 20 held-out worlds."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        flown = CoLocEnv("indoor-v0", 20, seed=0, **settings).rollout(settings["horizon"], policy)
-    return -float(flown["next", "uav", "reward"].mean())
+        env = CoLocEnv("indoor-v0", 20, seed=0, **settings)
+        rollout = env.rollout(settings["horizon"], policy)
+    return -float(rollout["next", "uav", "reward"].mean())
 
 
 def main(
@@ -106,9 +107,9 @@ def main(
         config=config,
     )
     before = mean_error(experiment.policy, settings)
-    began = time.perf_counter()
+    start = time.perf_counter()
     experiment.run()
-    speed = iterations * frames * 6 / (time.perf_counter() - began)
+    speed = iterations * frames * 6 / (time.perf_counter() - start)
     after = mean_error(experiment.policy, settings)
     print(f"mean error {before:.2f} m before, {after:.2f} m after")
     print(f"{speed:,.0f} agent-steps/s")

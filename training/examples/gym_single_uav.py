@@ -1,6 +1,6 @@
 """One learner among localizers: a single UAV as a Gymnasium environment, for stable-baselines3.
 
-The other UAVs are flown by a localizer (``others``). The learner starts from nothing: it moves its
+The other UAVs are localized by a filter (``others``). The learner starts from nothing: it moves its
 last estimate (``base="none"``; with a localizer's name it corrects that one's estimates instead).
 
     pip install -e .
@@ -44,15 +44,15 @@ def main(
     options: dict[str, Any] = {"others": "ekf", "base": "none", "motion": "random"}
     options["horizon"] = horizon
 
-    def flying(i: int) -> SingleUavEnv:
+    def make_env(i: int) -> SingleUavEnv:
         env = SingleUavEnv(**options)
         env.reset(seed=1_000_000 * (seed + 1) + 10_000 * i)  # the first of this one's own worlds
         return env
 
     # Not PPO(seed=...): that would restart the copies at worlds seed, seed + 1, ...; as each goes
-    # on to the next world by itself, they would fly the same worlds, and those of the score.
+    # on to the next world by itself, they would meet the same worlds, and those of the score.
     set_random_seed(seed)
-    train = VecNormalize(DummyVecEnv([partial(flying, i) for i in range(envs)]), gamma=0.0)
+    train = VecNormalize(DummyVecEnv([partial(make_env, i) for i in range(envs)]), gamma=0.0)
     model = PPO(
         "MlpPolicy",
         train,
@@ -69,9 +69,9 @@ def main(
 
     score = SingleUavEnv(**options)
     before = mean_error(score, policy, episodes, seed)
-    began = time.perf_counter()
+    start = time.perf_counter()
     model.learn(steps)
-    speed = model.num_timesteps / (time.perf_counter() - began)
+    speed = model.num_timesteps / (time.perf_counter() - start)
     after = mean_error(score, policy, episodes, seed)
     print(f"mean error {before:.2f} m before, {after:.2f} m after {model.num_timesteps} steps")
     print(f"{speed:,.0f} steps/s of the one UAV")

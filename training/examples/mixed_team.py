@@ -1,8 +1,8 @@
 """A mixed team: in one world every UAV localizes by a method of its own; RMSE per UAV.
 
 Methods are agents with their options, as ``coloc evaluate --agents`` takes them (``coloc agents``
-lists them); only those that act for a whole team at once (``ekf_joint``) are refused. UAVs hear
-each other's estimates, so one that is wrong and sure of itself harms the others.
+lists them); only those that act for a whole team at once (``ekf_joint``) are refused. UAVs receive
+each other's estimates, so one that is wrong and overconfident harms the others.
 
     pip install -e .
     python -m training.examples.mixed_team
@@ -20,7 +20,9 @@ from coloc_env import Scenario, make_scenario, parallel_env
 METHODS = ("ekf", "ekf:robust=huber", "pf500", "pfnn", "ekf_trust")
 
 
-def fly(scenario: Scenario, methods: Mapping[str, str], seeds: Sequence[int]) -> dict[str, float]:
+def evaluate(
+    scenario: Scenario, methods: Mapping[str, str], seeds: Sequence[int]
+) -> dict[str, float]:
     """RMSE (m) of each UAV over the worlds of these seeds."""
     env = parallel_env(scenario)
     team = Team(scenario, methods)
@@ -46,10 +48,10 @@ def main(
     methods = {f"uav_{i}": method for i, method in enumerate((learned, *METHODS))}
     scenario = make_scenario("indoor-v0", motion="random", nlos=nlos, horizon=horizon)
     seeds = range(seed, seed + episodes)
-    began = time.perf_counter()
-    mixed = fly(scenario, methods, seeds)
-    seconds = time.perf_counter() - began
-    alike = fly(scenario, dict.fromkeys(methods, "ekf"), seeds)
+    start = time.perf_counter()
+    mixed = evaluate(scenario, methods, seeds)
+    seconds = time.perf_counter() - start
+    alike = evaluate(scenario, dict.fromkeys(methods, "ekf"), seeds)
     for agent, method in methods.items():
         print(f"{agent}  {method:20} {mixed[agent]:.3f} m (all of them ekf: {alike[agent]:.3f} m)")
     print(f"{len(methods) * episodes * horizon / seconds:,.0f} agent-steps/s")

@@ -1,7 +1,7 @@
 """PettingZoo: the parallel loop, the agent-environment cycle, and ``pettingzoo.make``.
 
 Actions are displacements (m, in [-1, 1]) of each UAV's last estimate. Random ones let the estimates
-wander off; moving by ``fix_mean``, what the landmarks say on average, is a first localizer. The
+wander off; moving by ``fix_mean``, the mean of the fixes by landmarks, is a first localizer. The
 same worlds, agent by agent, give the same errors.
 
     pip install -e .
@@ -60,12 +60,12 @@ def main(episodes: int = 5, horizon: int = 200, seed: int = 0) -> dict[str, floa
     def by_landmarks(agent: str, observation: dict[str, np.ndarray]) -> np.ndarray:
         return observation["fix_mean"].clip(-1, 1)
 
-    began = time.perf_counter()
+    start = time.perf_counter()
     found = {
         "random": parallel(env, random, episodes, seed),
         "landmarks": parallel(env, by_landmarks, episodes, seed),
     }
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     found["landmarks, AEC"] = cycle(coloc_env.env(**options), by_landmarks, episodes, seed)
     for name, error in found.items():
         print(f"{name:15} mean error {error:6.2f} m")

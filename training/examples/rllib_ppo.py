@@ -3,7 +3,7 @@
 Traps: ``vf_clip_param`` is 10 by default, and there is no gradient where the critic's squared error
 is larger; ``train_batch_size_per_learner`` counts the world's steps, ``minibatch_size`` an agent's,
 and it must not be larger; without ``Flatten`` the Dict observations need ``FlattenObservations`` as
-a connector. (Should some UAVs fail and the rest be truncated, RLlib's own wrapper does not tell
+a connector. (Should some UAVs fail and the rest be truncated, RLlib's own wrapper does not report
 that the episode is over; ``Flatten`` refuses such scenarios.)
 
     pip install -e . "ray[rllib]==2.60.0"
@@ -74,13 +74,13 @@ def main(
     )
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     algorithm = config.build_algo()
-    torch.set_num_threads(1)  # Ray has its own mind about that
+    torch.set_num_threads(1)  # Ray sets another number
     before = mean_error(algorithm.get_module("uav"), settings, episodes)
-    began, agent_steps = time.perf_counter(), 0
+    start, agent_steps = time.perf_counter(), 0
     for _ in range(iterations):
         sampled = algorithm.train()["env_runners"]
         agent_steps += int(sum(sampled["num_agent_steps_sampled"].values()))
-    speed = agent_steps / (time.perf_counter() - began)
+    speed = agent_steps / (time.perf_counter() - start)
     after = mean_error(algorithm.get_module("uav"), settings, episodes)
     algorithm.stop()
     ray.shutdown()

@@ -1,7 +1,7 @@
 """stable-baselines3's PPO: one policy corrects every UAV's EKF; evaluated, saved, loaded.
 
 ``CoLocVecEnv`` is a native ``VecEnv``: every UAV of every world an environment of its own. The team
-believes its ranges to be four times as precise as they are: what a correction can mend.
+believes its ranges to be four times as precise as they are: an error that a policy can correct.
 
     pip install -e .
     python -m training.examples.sb3_ppo
@@ -21,12 +21,17 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from agents.wrappers.correction import with_base
 from coloc_env import CoLocVecEnv
 
-SCENE: dict[str, Any] = {"uwb_std": 0.2, "believed_uwb_std": 0.05, "nlos": 0.3, "motion": "random"}
+SCENARIO: dict[str, Any] = {
+    "uwb_std": 0.2,
+    "believed_uwb_std": 0.05,
+    "nlos": 0.3,
+    "motion": "random",
+}
 
 
 def worlds(number: int, horizon: int, seed: int) -> CoLocVecEnv:
-    """The first localizes by itself; what the learner adds to it is an action."""
-    return with_base(CoLocVecEnv("indoor-v0", number, seed, horizon=horizon, **SCENE), "ekf")
+    """The EKF localizes; the action is what the policy adds to its estimate."""
+    return with_base(CoLocVecEnv("indoor-v0", number, seed, horizon=horizon, **SCENARIO), "ekf")
 
 
 def mean_error(model: PPO | None, env: VecNormalize, seed: int) -> float:
@@ -70,12 +75,12 @@ def main(
         score, n_eval_episodes=score.num_envs, eval_freq=every, log_path=str(out), verbose=0
     )
     before = mean_error(None, score, 0)
-    began = time.perf_counter()
+    start = time.perf_counter()
     model.learn(steps, callback=callback)
-    speed = model.num_timesteps / (time.perf_counter() - began)
+    speed = model.num_timesteps / (time.perf_counter() - start)
 
     model.save(out / "policy")
-    train.save(str(out / "normal.pkl"))  # the policy is worth nothing without
+    train.save(str(out / "normal.pkl"))  # needed with the policy
     loaded = PPO.load(out / "policy", device="cpu")
     fresh = VecNormalize.load(str(out / "normal.pkl"), worlds(40, horizon, 0))
     fresh.training = fresh.norm_reward = False

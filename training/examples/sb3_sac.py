@@ -1,6 +1,6 @@
 """stable-baselines3's SAC: one policy for every UAV that localizes from nothing, by displacements.
 
-The action moves a UAV's last estimate by up to 1 m an axis; the policy sees what the landmarks say
+The action moves a UAV's last estimate by up to 1 m an axis; the policy sees the fixes by landmarks
 relative to it. Off-policy: every step of all UAVs goes into one replay buffer.
 
     pip install -e .
@@ -65,12 +65,12 @@ def main(
         score, n_eval_episodes=score.num_envs, eval_freq=every, log_path=str(out), verbose=0
     )
     before = mean_error(model, score, 0)
-    began = time.perf_counter()
+    start = time.perf_counter()
     model.learn(steps, callback=callback)
-    speed = model.num_timesteps / (time.perf_counter() - began)
+    speed = model.num_timesteps / (time.perf_counter() - start)
 
     model.save(out / "policy")
-    train.save(str(out / "normal.pkl"))  # the policy is worth nothing without
+    train.save(str(out / "normal.pkl"))  # needed with the policy
     loaded = SAC.load(out / "policy", device="cpu")
     fresh = VecNormalize.load(str(out / "normal.pkl"), worlds(20, horizon))
     fresh.training = fresh.norm_reward = False

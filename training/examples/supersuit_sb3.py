@@ -69,9 +69,9 @@ def main(
         device="cpu",
     )
     before = mean_error(model, train, horizon)
-    began = time.perf_counter()
+    start = time.perf_counter()
     model.learn(steps)
-    speed = model.num_timesteps / (time.perf_counter() - began)
+    speed = model.num_timesteps / (time.perf_counter() - start)
     after = mean_error(model, train, horizon)
     print(f"mean error {before:.2f} m before, {after:.2f} m after {model.num_timesteps} steps")
     print(f"{speed:,.0f} agent-steps/s")

@@ -1,8 +1,8 @@
 """MAPPO with TorchRL's own parts on the grouped environment: keys ``("uav", ...)``, batch [B, N].
 
 A policy of each UAV's own observation corrects its EKF; a critic sees those of the whole team. The
-team believes its ranges to be four times as precise as they are. (``training/mappo.py`` is the full
-version: one row per UAV, recurrent, resumable.)
+team believes its ranges to be four times as precise as they are. (The full version, with one row
+per UAV, recurrent and resumable, is ``training/learning/mappo.py``.)
 
     pip install -e .
     python -m training.examples.torchrl_mappo
@@ -25,13 +25,18 @@ from agents.policies.actor import Normalizer
 from agents.wrappers.correction import with_base
 from coloc_env import CoLocEnv
 
-SCENE: dict[str, Any] = {"uwb_std": 0.2, "believed_uwb_std": 0.05, "nlos": 0.3, "motion": "random"}
+SCENARIO: dict[str, Any] = {
+    "uwb_std": 0.2,
+    "believed_uwb_std": 0.05,
+    "nlos": 0.3,
+    "motion": "random",
+}
 SEEN, ACTION, VALUE = ("uav", "features"), ("uav", "action"), ("uav", "state_value")
 
 
 def environment(worlds: int, horizon: int, seed: int) -> EnvBase:
     """Corrections on an EKF; the leaves that a policy should read side by side in one entry."""
-    env = with_base(CoLocEnv("indoor-v0", worlds, seed=seed, horizon=horizon, **SCENE), "ekf")
+    env = with_base(CoLocEnv("indoor-v0", worlds, seed=seed, horizon=horizon, **SCENARIO), "ekf")
     leaves = [("uav", "observation", name) for name in env.mode.features]
     return TransformedEnv(env, CatTensors(leaves, SEEN, del_keys=False))
 
@@ -40,8 +45,8 @@ def environment(worlds: int, horizon: int, seed: int) -> EnvBase:
 def mean_error(policy: TensorDictModuleBase, horizon: int) -> float:
     """Mean error (m) of the best actions in 40 held-out worlds."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        flown = environment(40, horizon, 0).rollout(horizon, policy)
-    return -float(flown["next", "uav", "reward"].mean())
+        rollout = environment(40, horizon, 0).rollout(horizon, policy)
+    return -float(rollout["next", "uav", "reward"].mean())
 
 
 def main(
@@ -83,7 +88,7 @@ def main(
     batches = -(-steps // (rows * uavs))
     still = TensorDictModule(lambda seen: torch.zeros(*seen.shape[:-1], outputs), [SEEN], [ACTION])
     before = mean_error(still, horizon)
-    began = time.perf_counter()
+    start = time.perf_counter()
     collector = Collector(
         env,
         policy,
@@ -103,7 +108,7 @@ def main(
                 nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()
-    speed = batches * rows * uavs / (time.perf_counter() - began)
+    speed = batches * rows * uavs / (time.perf_counter() - start)
     collector.shutdown()
     after = mean_error(policy, horizon)
     print(f"mean error {before:.3f} m of the EKF, {after:.3f} m corrected")

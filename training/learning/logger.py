@@ -1,5 +1,6 @@
 """A run's metrics: TorchRL's CSV files, and TensorBoard beside them."""
 
+import os
 from pathlib import Path
 
 from torchrl.record import CSVLogger, TensorboardLogger
@@ -12,8 +13,8 @@ FOLDERS = ("metrics", "tensorboard")
 class RunLogger(CSVLogger):
     """Scalars as ``metrics/scalars/NAME.csv`` (lines ``frames,value``) and for TensorBoard.
 
-    What a run that died wrote after its save point at ``frames`` frames is cut off, and TensorBoard
-    gets the CSV files' lines anew: both then go on as those of a run that never died. ``last``
+    What a run that died wrote after its state at ``frames`` frames is cut off, and TensorBoard gets
+    the CSV files' lines again: both then go on as those of a run that never died. ``last``
     holds the newest value of each metric.
     """
 
@@ -36,6 +37,11 @@ class RunLogger(CSVLogger):
         self.last[name] = value
         self.board.log_scalar(name, value, step)
 
+    def sync(self) -> None:
+        """Put the CSV files on the disk, before a state that goes on from them."""
+        for file in self.experiment.files.values():
+            os.fsync(file.fileno())
+
     def close(self) -> None:
         """Write what TensorBoard's writer still holds."""
         self.board.experiment.close()
@@ -46,12 +52,15 @@ def _cut(scalars: Path, frames: int) -> list[tuple[str, int, float]]:
     kept = []
     for file in sorted(scalars.glob("**/*.csv")):
         good = []
-        for line in file.read_text().splitlines(keepends=True):
-            step, _, value = line.partition(",")
-            if not line.endswith("\n") or int(step) > frames:
+        for line in file.read_text(errors="replace").splitlines(keepends=True):
+            try:
+                step, value = int(line.partition(",")[0]), float(line.partition(",")[2])
+            except ValueError:
+                break
+            if not line.endswith("\n") or step > frames:
                 break
             good.append(line)
-            kept.append((str(file.relative_to(scalars).with_suffix("")), int(step), float(value)))
+            kept.append((str(file.relative_to(scalars).with_suffix("")), step, value))
         with staged_file(file) as staged:
             staged.write_text("".join(good))
     return kept

@@ -27,20 +27,25 @@ from agents.weights import drawn_from
 from agents.wrappers.correction import learners_mode
 from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.options import Factor, PositiveCount, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
-from training.learning.collectors import Flights, fly, world_seed
-from training.learning.fleets import SideBySide
-from training.learning.run import (
-    Progress,
-    Training,
-    at_least,
-    make_trainer,
-    positive,
-    shares,
+from training.evaluation.record import record
+from training.learning.collectors import (
+    Concatenated,
+    EpochCollector,
+    Epochs,
+    ScoreRuns,
+    Seed,
+    Steps,
+    Width,
+    Worlds,
+    episode_collector,
+    require_batches,
+    world_seed,
 )
+from training.learning.run import Progress, Training, make_trainer
 
 NORMALIZING = 40  # random steps from which inputs are normalized
 _KEPT = (
@@ -50,11 +55,13 @@ _KEPT = (
 _MEMORY = ("hidden", "cell")
 
 
-def environment(scene: Scenario, worlds: int, seed: int, base: str, feedback: float) -> PerUavEnv:
+def environment(
+    scenario: Scenario, worlds: int, seed: int, base: str, feedback: float
+) -> PerUavEnv:
     """``worlds`` worlds seen by each UAV for itself: corrections on a base's estimates, or, with
     ``base=none``, displacements of the UAV's own."""
-    mode = learners_mode(scene.believed, base, feedback)
-    return PerUavEnv(CoLocEnv(scene, worlds, seed=seed, action=mode))
+    mode = learners_mode(scenario.believed, base, feedback)
+    return PerUavEnv(CoLocEnv(scenario, worlds, seed=seed, action=mode))
 
 
 def policy_of(actor: Actor) -> ProbabilisticActor:
@@ -96,39 +103,34 @@ def _ppo(
     scenario: str = "indoor-v0:motion=random:horizon=200",
     variants: str = "",
     base: str = "ekf",
-    feedback: float = 0.0,
+    feedback: Share = 0.0,
     recurrent: bool = True,
-    hidden: int = 64,
-    worlds: int = 128,
-    epochs: int = 20,
-    steps: int = 25,
-    passes: int = 4,
-    minibatches: int = 8,
-    learning_rate: float = 1e-3,
-    gamma: float = 0.0,
-    gae_lambda: float = 0.95,
-    clip: float = 0.2,
-    entropy: float = 0.0,
-    seed: int = 0,
-    score_runs: int = 40,
+    hidden: Width = 64,
+    worlds: Worlds = 128,
+    epochs: Epochs = 20,
+    steps: Steps = 25,
+    passes: PositiveCount = 4,
+    minibatches: PositiveCount = 8,
+    learning_rate: Factor = 1e-3,
+    gamma: Share = 0.0,
+    gae_lambda: Share = 0.95,
+    clip: Factor = 0.2,
+    entropy: Share = 0.0,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 40,
 ) -> Training:
-    at_least(name, 1, worlds=worlds, epochs=epochs, steps=steps, passes=passes, hidden=hidden)
-    at_least(name, 1, minibatches=minibatches)
-    at_least(name, 0, score_runs=score_runs, seed=seed)
-    positive(name, learning_rate=learning_rate, clip=clip)
-    shares(name, gamma=gamma, gae_lambda=gae_lambda, entropy=entropy)
-    scenes = [parse_scenario(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
-    if worlds % len(scenes) or any(scene.horizon < steps for scene in scenes):
+    scenarios = [parse_scenario(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
+    require_batches(name, scenarios, steps)
+    if worlds % len(scenarios):
         raise ValueError(
-            f"{name}: worlds={worlds} must be a multiple of the {len(scenes)} variants, and no "
-            f"horizon shorter than steps={steps}"
+            f"{name}: worlds={worlds} must be a multiple of the {len(scenarios)} variants"
         )
-    share = worlds // len(scenes)
+    share = worlds // len(scenarios)
 
     def environments(first: int, each: int = share) -> list[PerUavEnv]:
         return [
-            environment(scene, each, first + i * each, base, feedback)
-            for i, scene in enumerate(scenes)
+            environment(one, each, first + i * each, base, feedback)
+            for i, one in enumerate(scenarios)
         ]
 
     ones = environments(0, 1)
@@ -158,17 +160,17 @@ def _ppo(
     loss.make_value_estimator(gamma=gamma, lmbda=gae_lambda)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
-    def launch(epoch: int) -> SideBySide:
+    def collect(epoch: int) -> Concatenated:
         # TorchRL draws actions from torch's shared generator: what an epoch draws must depend on
         # nothing but the epoch, so that a run that resumes at it ends in the same weights.
         torch.manual_seed(world_seed(seed, epoch, worlds))
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * (1 - epoch / epochs)
-        flying = environments(world_seed(seed, epoch, worlds))
-        return SideBySide([fly(env, policy, steps) for env in flying])
+        envs = environments(world_seed(seed, epoch, worlds))
+        return Concatenated([episode_collector(env, policy, steps) for env in envs])
 
-    flights = Flights(launch, epochs)
-    rows = worlds * scenes[0].arena.n_uavs
+    collector = EpochCollector(collect, epochs)
+    rows = worlds * scenarios[0].arena.n_uavs
     buffer = ReplayBuffer(  # of rows, each with its steps in order, as an LSTM needs them
         storage=LazyTensorStorage(rows),
         sampler=SamplerWithoutReplacement(),
@@ -182,15 +184,15 @@ def _ppo(
         buffer.empty()
         buffer.extend(batch.select(*kept))
 
-    trainer = make_trainer(flights, loss, optimizer, None, passes=passes, clip_norm=1.0)
+    trainer = make_trainer(collector, loss, optimizer, None, passes=passes, clip_norm=1.0)
     trainer.register_op("batch_process", fill)
     trainer.register_op("process_optim_batch", ReplayBufferTrainer(buffer, iterate=True).sample)
     trainer.register_op("pre_steps_log", _figures)
     return Training(
         module=actor,
-        flights=flights,
+        collector=collector,
         trainer=trainer,
-        score=partial(score, name, actor, scenes, score_runs),
+        score=partial(score, name, actor, scenarios, score_runs),
     )
 
 
@@ -199,7 +201,7 @@ def mappo(**options: Any) -> Training:
     """A policy for every UAV, with a critic that sees the team's truth (MAPPO, Yu et al. 2022).
 
     It corrects the estimates of a ``base`` localizer, or, with ``base=none``, localizes alone.
-    Every epoch flies ``worlds`` new worlds of the ``scenario`` to its horizon, in batches of
+    Every epoch runs ``worlds`` new worlds of the ``scenario`` to its horizon, in batches of
     ``steps`` steps; ``variants``, overrides joined by ``/``, share the worlds
     (``variants=nlos=0.3/false_matches=0.1``). ``recurrent``: an LSTM. ``gamma=0`` fits corrections
     that are not fed back (``feedback``): each is a bandit's. The learning rate falls linearly. At
@@ -233,9 +235,9 @@ def _figures(batch: TensorDictBase) -> dict[str, float]:
 def score(
     name: str,
     actor: Actor,
-    scenes: Sequence[Scenario],
+    scenarios: Sequence[Scenario],
     runs: int,
-    tell: Progress,
+    progress: Progress,
 ) -> Mapping[str, Any]:
     """RMSE (m) of the policy, its base and a Huber EKF in worlds 0 … runs − 1 of each scenario."""
     if runs == 0:
@@ -243,14 +245,14 @@ def score(
     found: dict[str, Any] = {}
     settings = actor.architecture["mode"]
     rivals = (settings.get("base", "dead_reckoning"), "ekf:robust=huber")
-    for scene in scenes:
-        mode = mode_of(scene.believed, settings)
-        team: dict[str, Any] = {name: PolicyAgent.of(scene.believed, actor, mode)}
-        team |= {rival: make(rival, scene) for rival in rivals}
-        key = ":".join(f"{k}={v}" for k, v in scene.overrides.items())
+    for scenario in scenarios:
+        mode = mode_of(scenario.believed, settings)
+        compared: dict[str, Any] = {name: PolicyAgent.of(scenario.believed, actor, mode)}
+        compared |= {rival: make(rival, scenario) for rival in rivals}
+        key = ":".join(f"{k}={v}" for k, v in scenario.overrides.items())
         found[key] = {}
-        for agent, one in team.items():
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            found[key][agent] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
-        tell("scoring", len(found), len(scenes))
+        for agent, one in compared.items():
+            result = record(one, scenario, torch.arange(runs))
+            found[key][agent] = metrics.rmse(result.error, result.worlds.scored)
+        progress("scoring", len(found), len(scenarios))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found}

@@ -19,20 +19,29 @@ from agents.policies.adapters import LocalizerPolicy
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
+from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from coloc_env.sensors import AnchorRanging
-from training.evaluation.rollout import play
-from training.learning.collectors import Flights, fly, world_seed
-from training.learning.fleets import SideBySide
-from training.learning.offline import offline_trainer
-from training.learning.run import Progress, Training, at_least, positive
+from training.evaluation.record import record
+from training.learning.collectors import (
+    Concatenated,
+    EpochCollector,
+    Epochs,
+    ScoreRuns,
+    Seed,
+    Worlds,
+    episode_collector,
+    world_seed,
+)
+from training.learning.replay_buffer import replay_buffer_trainer
+from training.learning.run import Progress, Training
 
 FAILED = 0.5  # m: an estimate farther off has failed
 # Low, medium and high: the team's beliefs of the acceleration (m²/s⁴) and of ranges (m²), and the
 # number of particles. Lowest and highest are those of the cases 1 to 3.
 _Q, _R, _PARTICLES = (0.0036, 0.06, 1.0), (0.0016, 0.04, 0.36), (500, 2000, 5000)
-VARIANTS = "/".join(f"q={q:g}:r_believed={r:g}" for q, r in product(_Q, _R))
+VARIANTS = "/".join(f"q={q:g}:believed_uwb_std={r**0.5:g}" for q, r in product(_Q, _R))
 MAINS = "/".join(f"pf:particles={count}" for count in _PARTICLES)
 
 
@@ -53,7 +62,7 @@ class DetectorLoss(LossModule):
 
 
 class Samples:
-    """What a flight writes down, as a ``LocalizerPolicy``'s ``record``: ``features`` [B, N, 5] of
+    """What an episode records, as a ``LocalizerPolicy``'s ``record``: ``features`` [B, N, 5] of
     the estimate, whether it has ``failed``, its ``error`` (m) and whether that is ``scored``
     [B, N]."""
 
@@ -65,11 +74,11 @@ class Samples:
         self.leaves, self.n_uavs = tuple(all_leaves(scenario)), scenario.arena.n_uavs
 
     def __call__(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        d, told = self.process.dim, tensordict["uav", "observation"]
+        d, observed = self.process.dim, tensordict["uav", "observation"]
         state = tensordict["state"].unflatten(-1, (self.n_uavs, -1))
         position = tensordict["uav", "action"][..., :d]
         seen = evidence(
-            self.model, self.process, position, Observation({k: told[k] for k in self.leaves})
+            self.model, self.process, position, Observation({k: observed[k] for k in self.leaves})
         )
         error = (position - state[..., :d]).norm(dim=-1)
         return {
@@ -81,7 +90,7 @@ class Samples:
 
 
 def samples_of(batch: TensorDictBase) -> TensorDict:
-    """A flight's samples [P], whichever world, step and UAV they are of."""
+    """An episode's samples [P], whichever world, step and UAV they are of."""
     train = batch["train"]
     entries = {key: train[key].flatten(0, 2) for key in ("features", "failed", "error")}
     rows = TensorDict(entries, entries["failed"].shape)[train["scored"].flatten()]
@@ -101,70 +110,67 @@ def nnhpff(
     scenario: str = "wsn-v0",
     variants: str = VARIANTS,
     mains: str = MAINS,
-    worlds: int = 2,
-    epochs: int = 20,
-    passes: int = 4,
-    minibatch: int = 1024,
-    learning_rate: float = 0.01,
-    seed: int = 0,
-    score_runs: int = 20,
+    worlds: Worlds = 2,
+    epochs: Epochs = 20,
+    passes: PositiveCount = 4,
+    minibatch: PositiveCount = 1024,
+    learning_rate: Factor = 0.01,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 20,
 ) -> Training:
     """The NN-HPFF paper's failure detector (5–10–5–2), from filters that run into trouble.
 
-    In each of ``epochs`` epochs every filter of ``mains`` flies ``worlds`` new worlds of the
+    In each of ``epochs`` epochs every filter of ``mains`` runs in ``worlds`` new worlds of the
     ``scenario`` in every one of ``variants`` (overrides; both lists are separated by slashes). An
     estimate more than 0.5 m off has failed. The defaults are the paper's 27 scenarios: low, medium
     and high process noise, range noise and number of particles. ``score_runs``: held-out worlds in
     which pf, hpff and nnhpff are compared at the end.
     """
-    at_least("nnhpff", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
-    at_least("nnhpff", 0, score_runs=score_runs, seed=seed)
-    positive("nnhpff", learning_rate=learning_rate)
-    scenes = [parse_scenario(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
-    kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenes}
+    scenarios = [parse_scenario(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
+    kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenarios}
     if len(kinds) > 1:
         raise ValueError(
             f"nnhpff: variants={variants!r} must have one horizon, one number of UAVs and one of "
             "anchors"
         )
-    crew = [
-        (LocalizerPolicy(make(main, scene), scene, record=Samples(scene)), scene)
-        for scene in scenes
+    filters = [
+        (LocalizerPolicy(make(main, one), one, record=Samples(one)), one)
+        for one in scenarios
         for main in mains.split("/")
     ]
     detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed), kinds
 
-    def launch(epoch: int) -> SideBySide:
-        first = world_seed(seed, epoch, worlds * len(crew))
-        flying = []
-        for i, (policy, scene) in enumerate(crew):
-            env = CoLocEnv(scene, worlds, seed=first + i * worlds)
-            flying.append(fly(env, policy, steps, compact_obs=True))
-        return SideBySide(flying)
+    def collect(epoch: int) -> Concatenated:
+        first = world_seed(seed, epoch, worlds * len(filters))
+        collectors = []
+        for i, (policy, one) in enumerate(filters):
+            env = CoLocEnv(one, worlds, seed=first + i * worlds)
+            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
+        return Concatenated(collectors)
 
-    flights = Flights(launch, epochs)
+    collector = EpochCollector(collect, epochs)
     loss = DetectorLoss(detector)
-    trainer = offline_trainer(
-        flights,
+    trainer = replay_buffer_trainer(
+        collector,
         loss,
         samples_of,
         partial(_figures, loss),
         learning_rate=learning_rate,
-        most=worlds * len(crew) * steps * n_uavs,
+        capacity=worlds * len(filters) * steps * n_uavs,
         minibatch=minibatch,
         passes=passes,
         seed=seed,
     )
     return Training(
         module=detector,
-        flights=flights,
+        collector=collector,
         trainer=trainer,
         score=partial(score, detector, scenario, score_runs),
     )
 
 
 def _figures(loss: DetectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
-    """Cross-entropy, that of always saying how many fail, that share, and how often it is right."""
+    """Cross-entropy, a constant forecast's, the share that failed, and the accuracy."""
     failed: Bool[Tensor, "P"] = rows["failed"]
     share = failed.double().mean()
     logits: Float32[Tensor, "P 2"] = loss.detector(rows["features"])
@@ -178,24 +184,24 @@ def _figures(loss: DetectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
     }
 
 
-def score(detector: FailureDetector, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
+def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -> Mapping[str, Any]:
     """Mean error (m) and resets a run of pf, hpff and nnhpff in the worlds of seeds 0 … runs − 1 of
     the three cases."""
     found: dict[str, Any] = {}
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
     for case in (1, 2, 3):
-        scene = parse_scenario(f"{base}:case={case}")
+        scenario = parse_scenario(f"{base}:case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
             options = {"weights": "none"} if name == "nnhpff" else {}
-            one: Any = make(name, scene, **options)
+            one: Any = make(name, scenario, **options)
             if name == "nnhpff":
                 one.learn(detector)
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_mean"] = float(tape.error.mean())
-            if "resets_per_run" in tape.series:
-                each[f"{name}_resets"] = float(tape.series["resets_per_run"].sum(1).mean())
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_mean"] = float(result.error.mean())
+            if "resets_per_run" in result.series:
+                each[f"{name}_resets"] = float(result.series["resets_per_run"].sum(1).mean())
         found[f"case {case}"] = each
-        tell("scoring", case, 3)
+        progress("scoring", case, 3)
     return {"runs": runs, "seeds": [0, runs - 1], **found}

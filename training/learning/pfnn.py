@@ -20,19 +20,23 @@ from agents.particle.corrector import motion_features
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env import noise
 from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
-from training.learning.collectors import Flight, Flights, fly, world_seed
-from training.learning.offline import offline_trainer
-from training.learning.run import (
-    Progress,
-    Training,
-    at_least,
-    make_trainer,
-    positive,
+from training.evaluation.record import record
+from training.learning.collectors import (
+    Batches,
+    EpochCollector,
+    Epochs,
+    ScoreRuns,
+    Seed,
+    Worlds,
+    episode_collector,
+    world_seed,
 )
+from training.learning.replay_buffer import replay_buffer_trainer
+from training.learning.run import Progress, Training, make_trainer
 
 EVERY = 10  # steps between trainings (section 2.3)
 PARTICLES = 50  # of each UAV that one training looks at (section 3.3.2)
@@ -63,12 +67,12 @@ class CorrectorLoss(LossModule):
 
 
 def masked_mean(x: Float[Tensor, "*w P"], mask: Bool[Tensor, "*w P"]) -> Float[Tensor, "*w"]:
-    """Mean over the last dimension where ``mask`` says so; 0 where it never does."""
+    """Mean over the last dimension where ``mask`` is True; 0 where it never is."""
     return (x * mask).sum(-1) / mask.sum(-1).clamp_min(1)
 
 
 class Samples:
-    """What the flying filter writes down for training, as a ``LocalizerPolicy``'s ``record``.
+    """What the filter records for training, as a ``LocalizerPolicy``'s ``record``.
 
     Of ``size`` random particles of each UAV: ``features`` [B, N, P, 6] (equation 11), ``target``
     [B, N, P] and ``mask``; and of the filter itself ``error`` (m) and ``count`` [B, N].
@@ -121,51 +125,49 @@ def pfnn(
     *,
     mode: Literal["offline", "online"] = "offline",
     scenario: str = "indoor-v0",
-    worlds: int = 8,
-    epochs: int = 20,
-    passes: int = 4,
-    minibatch: int = 1024,
-    learning_rate: float = LEARNING_RATE,
-    seed: int = 0,
-    score_runs: int = 10,
+    worlds: Worlds = 8,
+    epochs: Epochs = 20,
+    passes: PositiveCount = 4,
+    minibatch: PositiveCount = 1024,
+    learning_rate: Factor = LEARNING_RATE,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 10,
 ) -> Training:
     """The PF-NN paper's weight corrector, from the simulator's truth (equations 11 to 16).
 
-    Every epoch the filter flies new worlds with its newest weights. With ``mode=offline`` it learns
-    after the flight, from a replay buffer of the flight's particles, in several passes.
+    In every epoch the filter runs in new worlds with its newest weights. With ``mode=offline`` it
+    learns after the episode, from a replay buffer of the episode's particles, in several passes.
     ``mode=online`` is the paper's way: every 10 steps a step of gradient descent on each UAV's
-    particles in turn, in flight, which the filter uses at once (no ``passes``, no ``minibatch``).
+    particles in turn, which the filter uses at once (no ``passes``, no ``minibatch``).
 
     The ``scenario`` takes overrides: ``indoor-v0:motion=random:horizon=300``. At the end ``apf``
     and ``pfnn`` are compared in ``score_runs`` held-out worlds of it.
     """
-    at_least("pfnn", 1, worlds=worlds, epochs=epochs, passes=passes, minibatch=minibatch)
-    at_least("pfnn", 0, score_runs=score_runs, seed=seed)
-    positive("pfnn", learning_rate=learning_rate)
-    scene = parse_scenario(scenario)
-    if scene.horizon < EVERY:
-        raise ValueError(f"pfnn: a horizon of {scene.horizon} steps is too short: {EVERY} at least")
-    localizer: Any = make("pfnn", scene, weights="none", seed=seed)
+    parsed = parse_scenario(scenario)
+    if parsed.horizon < EVERY:
+        raise ValueError(
+            f"pfnn: a horizon of {parsed.horizon} steps is too short: {EVERY} at least"
+        )
+    localizer: Any = make("pfnn", parsed, weights="none", seed=seed)
     loss = CorrectorLoss(localizer.corrector)
-    steps = EVERY if mode == "online" else scene.horizon // EVERY * EVERY
+    steps = EVERY if mode == "online" else parsed.horizon // EVERY * EVERY
 
-    def launch(epoch: int) -> Flight:
-        policy = LocalizerPolicy(localizer, scene, record=Samples(scene))
-        env = CoLocEnv(scene, worlds, seed=world_seed(seed, epoch, worlds))
-        return fly(env, policy, steps, compact_obs=True)
+    def collect(epoch: int) -> Batches:
+        policy = LocalizerPolicy(localizer, parsed, record=Samples(parsed))
+        env = CoLocEnv(parsed, worlds, seed=world_seed(seed, epoch, worlds))
+        return episode_collector(env, policy, steps, compact_obs=True)
 
-    flights = Flights(launch, epochs)
+    collector = EpochCollector(collect, epochs)
     if mode == "online":
-        trainer = _online(flights, loss, learning_rate, scene.arena.n_uavs)
+        trainer = _online(collector, loss, learning_rate, parsed.arena.n_uavs)
     else:
-        most = worlds * scene.arena.n_uavs * PARTICLES * (steps // EVERY)
-        trainer = offline_trainer(
-            flights,
+        trainer = replay_buffer_trainer(
+            collector,
             loss,
             _samples,
             partial(_held_out, loss),
             learning_rate=learning_rate,
-            most=most,
+            capacity=worlds * parsed.arena.n_uavs * PARTICLES * (steps // EVERY),
             minibatch=minibatch,
             passes=passes,
             seed=seed,
@@ -173,22 +175,24 @@ def pfnn(
     trainer.register_op("pre_steps_log", _figures)
     return Training(
         module=localizer.corrector,
-        flights=flights,
+        collector=collector,
         trainer=trainer,
-        score=partial(score, localizer, scene, score_runs),
+        score=partial(score, localizer, parsed, score_runs),
     )
 
 
-def _online(flights: Flights, loss: CorrectorLoss, learning_rate: float, n_uavs: int) -> Trainer:
+def _online(
+    collector: EpochCollector, loss: CorrectorLoss, learning_rate: float, n_uavs: int
+) -> Trainer:
     """Plain gradient descent on each UAV's particles in turn, once a batch (Algorithm 1)."""
     optimizer = torch.optim.SGD(loss.parameters(), learning_rate)
-    trainer, in_turn = make_trainer(flights, loss, optimizer, n_uavs), InTurn(n_uavs)
+    trainer, in_turn = make_trainer(collector, loss, optimizer, n_uavs), InTurn(n_uavs)
     trainer.register_op("process_optim_batch", lambda batch: in_turn(batch).flatten())
     return trainer
 
 
 def _samples(batch: TensorDictBase) -> TensorDict:
-    """All particles of a flight that count."""
+    """All particles of an episode that count."""
     rows = samples_of(batch).flatten()
     return rows[rows["mask"]]
 
@@ -208,23 +212,23 @@ def _figures(batch: TensorDictBase) -> dict[str, float]:
     return {"rmse": float(squared.sqrt()), "particles": float(train["count"].double().mean())}
 
 
-def score(localizer: Any, scenario: Scenario, runs: int, tell: Progress) -> Mapping[str, Any]:
+def score(localizer: Any, scenario: Scenario, runs: int, progress: Progress) -> Mapping[str, Any]:
     """RMSE (m) of ``apf`` and of the trained filter in the worlds of seeds 0 … runs − 1."""
     if runs == 0:
         return {}
-    plain, tapes = make("apf", scenario, seed=localizer.seed), {}
+    plain, records = make("apf", scenario, seed=localizer.seed), {}
     for name, one in (("apf", plain), ("pfnn", localizer)):
         done = 0
 
         def tick(steps: int, name: str = name) -> None:
             nonlocal done
             done += steps
-            tell(f"scoring {name}", done, runs * scenario.horizon)
+            progress(f"scoring {name}", done, runs * scenario.horizon)
 
-        tapes[name] = play(one, scenario, torch.arange(runs), tick)
+        records[name] = record(one, scenario, torch.arange(runs), tick)
     per_run = {
-        name: metrics.rmse_per_run(tape.error.numpy(), tape.scored.numpy())
-        for name, tape in tapes.items()
+        name: metrics.rmse_per_run(result.error, result.worlds.scored)
+        for name, result in records.items()
     }
     difference = metrics.paired_difference(per_run["pfnn"], per_run["apf"])
     return {

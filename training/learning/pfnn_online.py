@@ -1,4 +1,4 @@
-"""The PF-NN paper's own experiment: a corrector that learns from nothing while it flies."""
+"""The PF-NN paper's own experiment: a corrector that learns from nothing while the filter runs."""
 
 from copy import deepcopy
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from agents import make
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
-from training.learning.collectors import Flight, Flights, fly
+from training.learning.collectors import Batches, EpochCollector, episode_collector
 from training.learning.pfnn import EVERY, LEARNING_RATE, CorrectorLoss, InTurn, Samples, samples_of
 from training.learning.run import Progress, make_trainer
 
 
 @dataclass(frozen=True)
-class InFlight:
+class OnlineLearning:
     """R worlds over K steps, N UAVs, each world with a network of its own that learned at L of the
     steps: ``error`` (m), ``count`` of particles, and equation 16's ``loss`` over all UAVs before
     each training."""
@@ -47,14 +47,14 @@ class PerWorld(nn.Module):
         return torch.func.vmap(one)(tuple(self.weights), features)
 
 
-def learn_in_flight(
-    scenario: Scenario, runs: int, seed: int, tell: Progress, **options: Any
-) -> InFlight:
-    """Fly ``pfnn`` as the paper does in the worlds of seeds ``seed`` …, which are those of
+def learn_online(
+    scenario: Scenario, runs: int, seed: int, progress: Progress, **options: Any
+) -> OnlineLearning:
+    """Run ``pfnn`` as the paper does in the worlds of seeds ``seed`` …, which are those of
     ``coloc evaluate``: random weights at the start (seeded like the world), and every 10 steps one
     of gradient descent on 50 particles of each UAV in turn.
 
-    ``options`` are ``pfnn``'s own (``correction=(0.2, 1.0)``). All worlds fly at once.
+    ``options`` are ``pfnn``'s own (``correction=(0.2, 1.0)``). All worlds run at once.
     """
 
     def filter_of(world: int) -> Any:
@@ -64,26 +64,27 @@ def learn_in_flight(
     localizer.corrector = PerWorld([filter_of(seed + b).corrector for b in range(runs)])
     loss = CorrectorLoss(localizer.corrector)
 
-    def launch(epoch: int) -> Flight:
+    def collect(epoch: int) -> Batches:
         policy = LocalizerPolicy(localizer, scenario, record=Samples(scenario))
-        return fly(CoLocEnv(scenario, runs, seed=seed), policy, EVERY, compact_obs=True)
+        env = CoLocEnv(scenario, runs, seed=seed)
+        return episode_collector(env, policy, EVERY, compact_obs=True)
 
     errors, counts, losses = [], [], []
 
     @torch.no_grad()
-    def note(batch: TensorDictBase) -> None:
+    def record(batch: TensorDictBase) -> None:
         errors.append(batch["train", "error"])
         counts.append(batch["train", "count"])
         losses.append(loss.error(samples_of(batch).flatten(1, 2)))
-        tell("pfnn, learning in flight", EVERY * len(errors), scenario.horizon)
+        progress("pfnn, learning online", EVERY * len(errors), scenario.horizon)
 
     trainer = make_trainer(
-        Flights(launch, 1),
+        EpochCollector(collect, 1),
         loss,
         torch.optim.SGD(loss.parameters(), LEARNING_RATE),
         scenario.arena.n_uavs,
     )
-    trainer.register_op("batch_process", note)
+    trainer.register_op("batch_process", record)
     trainer.register_op("process_optim_batch", InTurn(scenario.arena.n_uavs))
     trainer.train()
-    return InFlight(torch.cat(errors, 1), torch.cat(counts, 1), torch.stack(losses, 1))
+    return OnlineLearning(torch.cat(errors, 1), torch.cat(counts, 1), torch.stack(losses, 1))

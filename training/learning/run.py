@@ -1,18 +1,19 @@
-"""Training runs: one directory each, that a dead process's successor continues exactly.
+"""Training runs: one folder each, which another process can continue exactly.
 
-- run.json: what is trained, with which options, command and versions;
-- metrics/, tensorboard/: training.learning.logger;
-- state.safetensors: the save point of the last whole epoch, until the run is finished;
-- NAME.safetensors, NAME.json: the trained weights and their card, once it is.
+- run.json: what is trained, with which options, command and versions; locked while a process trains
+- metrics/, tensorboard/: training.learning.logger
+- state.safetensors: the state after the last whole epoch, until the run is finished
+- NAME.safetensors, NAME.json: the trained weights and their card, once it is
 """
 
 import json
 import platform
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -20,32 +21,40 @@ from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
-from agents.weights import SUFFIX, Learned
+from agents.weights import SUFFIX, Learned, write
 from coloc_env import options
-from coloc_env.staging import staged_folder
+from coloc_env.json_files import read_json
+from coloc_env.options import Quantity
+from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
 from training.evaluation.results import typed
-from training.learning import checkpoints
-from training.learning import state as savepoints
-from training.learning.collectors import Flights
+from training.learning import state
+from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
 from training.learning.registry import TRAININGS
+from training.threads import use_threads
 
 Progress = Callable[[str, int, int], None]
 _CONFIG, _STATE = "run.json", "state.safetensors"
-_MOST = 10**9  # of anything that can be chosen; seeds included
-_EVER = 1 << 62  # frames: the flights end a training, not a number of frames
+_FIELDS = {
+    "training": str,
+    "options": dict,
+    "command": str,
+    "threads": Annotated[int, Quantity("", 1, 1 << 12)],
+}
+_OPTIONAL = {"versions": dict[str, str]}
+_UNBOUNDED = 1 << 62  # frames: the epochs end a training, not a number of frames
 _VERSIONS = ("coloc-env", "torch", "torchrl", "tensordict", "safetensors", "numpy")
 
 
-class Epochs(Protocol):
-    """How far a training is, in whole epochs; ``landed`` is called after each."""
+class CountsEpochs(Protocol):
+    """How far a training is, in whole epochs; ``on_epoch_end`` is called after each."""
 
     epoch: int
     epochs: int
-    landed: Callable[[int], None]
+    on_epoch_end: Callable[[int], None]
 
 
-class Trains(Protocol):
+class TrainerLike(Protocol):
     """What runs ask of a trainer: TorchRL's Trainer, or one that does the same."""
 
     logger: Any
@@ -60,16 +69,16 @@ class Trains(Protocol):
 
 @dataclass(frozen=True)
 class Training:
-    """What there is to a training beside its directory.
+    """What there is to a training beside its folder.
 
     ``module`` is what learns, and is written at the end; ``trainer`` is ``make_trainer``'s over
-    ``flights``, with hooks of its own (or both are another library's); ``score`` measures what was
-    learned, for the card.
+    ``collector``, with hooks of its own (or both are another library's); ``score(progress)``
+    measures what was learned, for the card.
     """
 
     module: Learned
-    flights: Epochs
-    trainer: Trains
+    collector: CountsEpochs
+    trainer: TrainerLike
     score: Callable[[Progress], Mapping[str, Any]]
 
 
@@ -80,29 +89,8 @@ class _Stepper(DefaultOptimizationStepper):
         return super().step(trainer, sub_batch).detach()
 
 
-def at_least(training: str, least: int, **chosen: int) -> None:
-    """ValueError for a whole number chosen below ``least``, or beyond all sense."""
-    for name, value in chosen.items():
-        if not least <= value < _MOST:
-            raise ValueError(f"{training}: {name}={value} is not allowed: {least} to {_MOST}")
-
-
-def positive(training: str, **chosen: float) -> None:
-    """ValueError for a number that is not more than 0."""
-    for key, value in chosen.items():
-        if not 0 < value < float("inf"):
-            raise ValueError(f"{training}: {key}={value} is not allowed: more than 0")
-
-
-def shares(training: str, **chosen: float) -> None:
-    """ValueError for a number beyond [0, 1]."""
-    for key, value in chosen.items():
-        if not 0 <= value <= 1:
-            raise ValueError(f"{training}: {key}={value} is not allowed: a number in [0, 1]")
-
-
 def make_trainer(
-    flights: Flights,
+    collector: EpochCollector,
     loss: LossModule,
     optimizer: Optimizer,
     steps_per_batch: int | None = 1,
@@ -116,8 +104,8 @@ def make_trainer(
     a replay buffer's iteration gives); ``clip_norm`` bounds the gradient's norm.
     """
     return Trainer(
-        collector=flights,
-        total_frames=_EVER,
+        collector=collector,
+        total_frames=_UNBOUNDED,
         frame_skip=1,
         optim_steps_per_batch=steps_per_batch,
         num_epochs=passes,
@@ -130,14 +118,12 @@ def make_trainer(
     )
 
 
-def start(name: str, chosen: Mapping[str, Any], out: Path, tell: Progress) -> Path:
-    """Train from the beginning, in the directory ``out``; returns the weights' file."""
+def start(name: str, chosen: Mapping[str, Any], out: Path, progress: Progress) -> Path:
+    """Train from the beginning, in the folder ``out``; returns the weights' file. Raises ValueError
+    for options that do not fit, or a folder in use, before anything is written."""
     chosen = options.checked(name, chosen, TRAININGS.options_of(name))
-    if (out / _CONFIG).exists():
-        raise ValueError(f"{out} holds a run: --resume {out} continues it")
-    if out.is_dir() and any(out.iterdir()):
-        raise ValueError(f"{out} is not empty: a run has a folder of its own")
-    TRAININGS[name](**chosen)  # what is wrong with the options is said before anything is written
+    _require_new(out)
+    training = _built(name, chosen)
     config = {
         "training": name,
         "options": dict(chosen),
@@ -145,71 +131,136 @@ def start(name: str, chosen: Mapping[str, Any], out: Path, tell: Progress) -> Pa
         "threads": torch.get_num_threads(),
         "versions": _versions(),
     }
+    _require_new(out)  # still
     with staged_folder(out, [_CONFIG]) as folder:
-        (folder / _CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-    return _go_on(out, config, tell)
+        text = json.dumps(config, indent=2, ensure_ascii=False) + "\n"
+        (folder / _CONFIG).write_text(text, encoding="utf-8")
+    with _alone(out):
+        return _train(out, config, training, progress)
 
 
-def resume(folder: Path, tell: Progress) -> Path:
-    """Continue the run in a directory to the weights that it would have had if it had never
-    stopped; returns their file."""
+def resume(folder: Path, progress: Progress) -> Path:
+    """Continue the run in a folder to the weights that it would have had if it had never stopped;
+    returns their file."""
     config = _config(folder)
-    for leftover in folder.rglob(".*.partial-*"):
-        leftover.unlink()
-    torch.set_num_threads(config["threads"])
-    return _go_on(folder, config, tell)
-
-
-def _go_on(folder: Path, config: Mapping[str, Any], tell: Progress) -> Path:
-    name = config["training"]
-    weights = folder / f"{name}{SUFFIX}"
+    weights = _weights(folder, config)
     if weights.with_suffix(".json").exists():
         return weights
-    training = TRAININGS[name](**config["options"])
-    trainer, flights, state = training.trainer, training.flights, folder / _STATE
-    if state.exists():
-        trainer.load_state_dict(savepoints.load(state))
+    with _alone(folder):
+        remove_leftovers(folder)
+        use_threads(config["threads"], f"{folder / _CONFIG}: threads")
+        return _train(folder, config, _built(config["training"], config["options"]), progress)
+
+
+def _train(folder: Path, config: Mapping[str, Any], training: Training, progress: Progress) -> Path:
+    """Train from the folder's state, if there is one, to the end."""
+    name, weights, file = config["training"], _weights(folder, config), folder / _STATE
+    trainer, collector = training.trainer, training.collector
+    if file.exists():
+        _restore(file, config, trainer)
     logger = trainer.logger = RunLogger(folder, trainer.collected_frames)
-    tell(name, flights.epoch, flights.epochs)
+    progress(name, collector.epoch, collector.epochs)
 
     def save(epochs: int) -> None:
-        savepoints.save(state, trainer.state_dict())
-        tell(name, epochs, flights.epochs)
+        logger.sync()
+        state.save(file, {"run": _identity(config), "trainer": trainer.state_dict()})
+        progress(name, epochs, collector.epochs)
 
-    flights.landed = save
+    collector.on_epoch_end = save
     trainer.train()
     logger.close()
+    _require_learned(name, training)
+    defaults = {key: one.default for key, one in TRAININGS.options_of(name).items()}
     card = {
         "command": config["command"],
         "training": name,
-        "options": {key: p.default for key, p in TRAININGS.options_of(name).items()}
-        | config["options"],
-        "epochs": flights.epochs,
+        "options": defaults | config["options"],
+        "epochs": collector.epochs,
         "frames": trainer.collected_frames,
         "versions": _versions(),
         "metrics": logger.last,
-        "scores": training.score(tell),
+        "scores": training.score(progress),
     }
-    checkpoints.write(weights, training.module, card)
-    state.unlink(missing_ok=True)
+    write(weights, training.module, card)
+    file.unlink(missing_ok=True)
     return weights
 
 
+def _built(name: str, chosen: Mapping[str, Any]) -> Training:
+    factory = TRAININGS[name]
+    try:
+        training: Training = factory(**options.grouped(factory, chosen))
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "memory" not in str(error):
+            raise
+        raise ValueError(f"{name}: these options need more memory than there is") from None
+    return training
+
+
+def _require_new(out: Path) -> None:
+    """Raise ValueError if a folder holds a run, or anything else."""
+    if (out / _CONFIG).exists():
+        raise ValueError(f"{out} holds a run: --resume {out} continues it")
+    if out.is_dir():
+        recover(out)
+        if any(not entry.name.startswith(f".{out.resolve().name}.") for entry in out.iterdir()):
+            raise ValueError(f"{out} is not empty: a run has a folder of its own")
+
+
+def _require_learned(name: str, training: Training) -> None:
+    """Raise ValueError for a training that has seen nothing, or has lost its numbers."""
+    if training.trainer.collected_frames == 0:
+        raise ValueError(f"{name}: no frames were collected, so nothing was learned")
+    for key, value in training.module.state_dict().items():
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(
+                f"{name}: {key} is NaN or infinite after training; a lower learning rate may help"
+            )
+
+
+def _alone(folder: Path) -> AbstractContextManager[None]:
+    """The run's lock; ValueError if another process trains in the folder."""
+    return locked(folder / _CONFIG, f"{folder} is in use: another process trains there")
+
+
+def _weights(folder: Path, config: Mapping[str, Any]) -> Path:
+    return folder / f"{config['training']}{SUFFIX}"
+
+
+def _identity(config: Mapping[str, Any]) -> str:
+    """What a state is of: another training's, or one's with other options, does not fit."""
+    return json.dumps([config["training"], config["options"]], sort_keys=True)
+
+
+def _restore(file: Path, config: Mapping[str, Any], trainer: TrainerLike) -> None:
+    """Put a state into a trainer; ValueError if it is another run's."""
+    found = state.load(file)
+    if found.get("run") != _identity(config):
+        raise ValueError(
+            f"{file} is the state of {found.get('run')}, {_CONFIG} describes {_identity(config)}"
+        )
+    try:
+        trainer.load_state_dict(found["trainer"])
+    except (LookupError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(
+            f"{file} does not fit this version's {config['training']}: {text}"
+        ) from None
+
+
 def _config(folder: Path) -> dict[str, Any]:
-    """What a run's directory says of it; ValueError if it says nothing that makes sense."""
+    """A folder's run.json; ValueError if there is none, or it does not describe a run."""
     file = folder / _CONFIG
+    if folder.is_dir():
+        recover(folder)
     if not file.is_file():
         raise ValueError(f"{folder} holds no run: {file} does not exist")
-    try:
-        config = json.loads(file.read_text())
-    except ValueError as error:
-        raise ValueError(f"{file} is not JSON: {error}") from None
-    needed = {"training": str, "options": dict, "command": str, "threads": int}
-    for key, kind in needed.items():
-        if not isinstance(config, dict) or not isinstance(config.get(key), kind):
-            raise ValueError(f"{file} describes no run: {', '.join(needed)} are needed")
+    config = read_json(file, "a run", _FIELDS, _OPTIONAL)
     name = config["training"]
-    config["options"] = options.checked(name, config["options"], TRAININGS.options_of(name))
+    try:
+        config["options"] = options.checked(name, config["options"], TRAININGS.options_of(name))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     return config
 
 

@@ -17,10 +17,20 @@ from agents.policies.actor import Actor
 from agents.policies.learned import actor_for
 from agents.wrappers.correction import learners_mode
 from coloc_env.envs.sb3 import CoLocVecEnv
+from coloc_env.options import Factor, PositiveCount, Share
 from coloc_env.scenarios import parse_scenario
-from training.learning.collectors import world_seed
+from training.learning.collectors import (
+    Epochs,
+    ScoreRuns,
+    Seed,
+    Steps,
+    Width,
+    Worlds,
+    require_batches,
+    world_seed,
+)
 from training.learning.mappo import score
-from training.learning.run import Training, at_least, positive, shares
+from training.learning.run import Training
 
 _RUNNING = ("obs_rms", "ret_rms")
 
@@ -63,7 +73,7 @@ class Sb3Trainer:
         self.rate = model.lr_schedule(1.0)
         self.collected_frames = 0
         self.logger: Any = None
-        self.landed: Callable[[int], None] = lambda epochs: None
+        self.on_epoch_end: Callable[[int], None] = lambda epochs: None
 
     def train(self) -> None:
         self.model.set_logger(Logger(None, [_Metrics(self)]))
@@ -81,7 +91,7 @@ class Sb3Trainer:
             self.collected_frames = self.model.num_timesteps
             self.epoch += 1
             exported(self.model, self.env, self.actor)
-            self.landed(self.epoch)
+            self.on_epoch_end(self.epoch)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next epoch depends on."""
@@ -117,8 +127,8 @@ def _constant(rate: float, left: float) -> float:
 
 
 class _Errors(BaseCallback):
-    """Logs the RMSE (m) of a rollout whose rewards are −error, with what PPO tells of training on
-    it (SB3 itself would keep that until after the next rollout, when a save point is past)."""
+    """Logs the RMSE (m) of a rollout whose rewards are −error, with PPO's figures of training on it
+    (SB3 itself would keep those until after the next rollout, when the state has been saved)."""
 
     def _on_rollout_start(self) -> None:
         self.squares: list[float] = []
@@ -154,18 +164,18 @@ def sb3_ppo(
     *,
     scenario: str = "indoor-v0:motion=random:horizon=200",
     base: str = "ekf",
-    feedback: float = 0.0,
-    hidden: int = 64,
-    worlds: int = 128,
-    epochs: int = 20,
-    steps: int = 25,
-    passes: int = 4,
-    minibatches: int = 8,
-    learning_rate: float = 1e-3,
-    gamma: float = 0.0,
-    clip: float = 0.2,
-    seed: int = 0,
-    score_runs: int = 40,
+    feedback: Share = 0.0,
+    hidden: Width = 64,
+    worlds: Worlds = 128,
+    epochs: Epochs = 20,
+    steps: Steps = 25,
+    passes: PositiveCount = 4,
+    minibatches: PositiveCount = 8,
+    learning_rate: Factor = 1e-3,
+    gamma: Share = 0.0,
+    clip: Factor = 0.2,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 40,
 ) -> Training:
     """A policy for every UAV by stable-baselines3's PPO, with shared parameters.
 
@@ -174,16 +184,12 @@ def sb3_ppo(
     them.
     """
     name = "sb3-ppo"
-    at_least(name, 1, worlds=worlds, epochs=epochs, passes=passes, hidden=hidden)
-    at_least(name, 1, minibatches=minibatches, steps=steps)
-    at_least(name, 0, score_runs=score_runs, seed=seed)
-    positive(name, learning_rate=learning_rate, clip=clip)
-    shares(name, gamma=gamma)
-    scene = parse_scenario(scenario)
-    if scene.horizon % steps:
-        raise ValueError(f"{name}: steps={steps} must divide the horizon, {scene.horizon}")
-    mode = learners_mode(scene.believed, base, feedback)
-    worlds_env = CoLocVecEnv(scene, worlds, action=mode)
+    parsed = parse_scenario(scenario)
+    require_batches(name, [parsed], steps)
+    if parsed.horizon % steps:
+        raise ValueError(f"{name}: steps={steps} must divide the horizon, {parsed.horizon}")
+    mode = learners_mode(parsed.believed, base, feedback)
+    worlds_env = CoLocVecEnv(parsed, worlds, action=mode)
     env = VecNormalize(worlds_env, gamma=gamma)
     rows = worlds_env.num_envs * steps
     if 2 * minibatches > rows:
@@ -206,7 +212,7 @@ def sb3_ppo(
     trainer = Sb3Trainer(model, env, actor, epochs, partial(world_seed, seed, worlds=worlds))
     return Training(
         module=actor,
-        flights=trainer,
+        collector=trainer,
         trainer=trainer,
-        score=partial(score, name, actor, [scene], score_runs),
+        score=partial(score, name, actor, [parsed], score_runs),
     )

@@ -1,16 +1,17 @@
-"""Save points: everything a training needs to go on, in one file, without pickle.
+"""A training's resumable state: everything that it needs to go on, in one file, without pickle.
 
-Tensors are kept by safetensors; all else is JSON in that file's header. One file, renamed into
-place, is either the old save point or the new one, whenever the process dies.
+Tensors are kept by safetensors; all else is JSON in that file's header, beside a SHA-256 of both.
+One file, renamed into place, is either the old state or the new one, whenever the process dies.
 """
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialized
 from torch import Tensor
 
 from coloc_env.staging import staged_file
@@ -20,19 +21,33 @@ def save(file: Path, state: Mapping[str, Any]) -> None:
     """Write a state: nested dictionaries and lists of tensors, numbers, texts and None."""
     tensors: dict[str, Tensor] = {}
     tree = json.dumps(_pack(state, tensors))
+    data = serialized(tensors, {"tree": tree, "sha256": _sha256(tree, tensors)})
     with staged_file(file) as staged:
-        save_file(tensors, staged, {"tree": tree})
+        staged.write_bytes(data)
 
 
 def load(file: Path) -> dict[str, Any]:
-    """The state that ``save`` wrote, every bit of it; tuples come back as lists."""
+    """The state that ``save`` wrote, every bit of it; tuples come back as lists. Raises ValueError
+    if it has changed since, or has no checksum, as those of coloc 0.1 had none."""
     try:
         with safe_open(file, "pt") as opened:
+            header = opened.metadata() or {}
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-            tree = json.loads(opened.metadata()["tree"])
-        return _unpack(tree, tensors)
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, TypeError, ValueError) as error:
         raise ValueError(f"{file} is damaged: {type(error).__name__}: {error}") from None
+    if "tree" not in header or "sha256" not in header:
+        raise ValueError(
+            f"{file} has no checksum (an older coloc wrote it, or it is damaged): "
+            "the run must start again"
+        )
+    if _sha256(header["tree"], tensors) != header["sha256"]:
+        raise ValueError(f"{file} is damaged: its SHA-256 differs from what was written")
+    return _unpack(json.loads(header["tree"]), tensors)
+
+
+def _sha256(tree: str, tensors: Mapping[str, Tensor]) -> str:
+    """Of all that a state is, whichever the order of its header's entries."""
+    return hashlib.sha256(serialized(dict(tensors), {"tree": tree})).hexdigest()
 
 
 def _pack(value: Any, tensors: dict[str, Tensor]) -> Any:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -19,24 +19,28 @@ from agents.stdcl.network import StGnn
 from agents.weights import learned
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
+from coloc_env.options import Factor, Quantity, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning.augmentation import SwarmAugmentation
-from training.learning.collectors import Flights, fly, world_seed
-from training.learning.fleets import TakingTurns
-from training.learning.run import (
-    Progress,
-    Training,
-    at_least,
-    make_trainer,
-    positive,
-    shares,
+from training.learning.collectors import (
+    EpochCollector,
+    Epochs,
+    RoundRobin,
+    ScoreRuns,
+    Seed,
+    Steps,
+    Worlds,
+    episode_collector,
+    require_batches,
+    world_seed,
 )
+from training.learning.run import Progress, Training, make_trainer
 
 # 60 to 150 UAVs; a radius of 15 km gives 60 of them the degree that 200 have at 5 km. Weaves and
-# the layouts u and o are never flown in training: they are for the final test.
+# the layouts u and o are never met in training: they are for the final test.
 VARIANTS = (
     "comm_radius=15000",
     "comm_radius=15000:ins_bias=0",
@@ -54,7 +58,7 @@ VARIANTS = (
     "n_uavs=100:comm_radius=3500:nlos=0.3:motion=line",
     "n_uavs=150:comm_radius=2500",
     "n_uavs=150:comm_radius=2500:ins_bias=0:nlos=0.3:nlos_time=10",
-    "n_uavs=100:comm_radius=2200:anchors=0.25:motion=circle",
+    "n_uavs=100:comm_radius=2200:anchor_share=0.25:motion=circle",
     "n_uavs=150:comm_radius=1400",
     "n_uavs=120:comm_radius=1800:nlos=0.3",
 )
@@ -70,8 +74,8 @@ class StDclLoss(LossModule):
     """Position error in units of the optimizer's own, in a variant; equation 37 and, in the second
     stage, the trajectory's second difference beside it.
 
-    The loop is closed again over the batch [B, T], from the belief that its first step was flown
-    with and on the observations that were made, this time with gradients: truncated backpropagation
+    The loop is closed again over the batch [B, T], from the belief that its first step started
+    from and on the observations that were made, this time with gradients: truncated backpropagation
     through time. The second difference is that of the estimate minus that of the path by INS, so
     that manoeuvres are not smoothed away.
     """
@@ -83,22 +87,22 @@ class StDclLoss(LossModule):
         self,
         network: StGnn,
         loops: Sequence[NetworkLoop],
-        scenes: Sequence[Scenario],
+        scenarios: Sequence[Scenario],
         scales: Sequence[float],
     ) -> None:
         super().__init__()
         self.network = network
-        self.loops, self.scenes, self.scales = tuple(loops), tuple(scenes), tuple(scales)
+        self.loops, self.scenarios, self.scales = tuple(loops), tuple(scenarios), tuple(scales)
         self.smooth = 0.0  # weight of the second difference
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         train = tensordict["train"]
         variant = int(train["variant"][0, 0])
-        loop, scene, scale = self.loops[variant], self.scenes[variant], self.scales[variant]
-        n, d, free = scene.arena.n_uavs, scene.arena.dim, slice(scene.guides, None)
+        loop, scenario, scale = self.loops[variant], self.scenarios[variant], self.scales[variant]
+        n, d, free = scenario.arena.n_uavs, scenario.arena.dim, slice(scenario.anchor_uavs, None)
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
         observed = tensordict["uav", "observation"]
-        leaves = tuple(all_leaves(scene))
+        leaves = tuple(all_leaves(scenario))
         belief: Any = None
         positions, variances = [], []
         for t in range(tensordict.shape[1]):
@@ -111,8 +115,8 @@ class StDclLoss(LossModule):
             variances.append(estimate.covariance[:, free, 0, 0])
         found = torch.stack(positions, 1)
         error, scored = found - state[:, :, free, :d], state[:, :, free, -1] > 0
-        flown = observed["ins"][:, :, free].double().cumsum(1) * scene.arena.dt
-        bent = (found - flown).diff(n=2, dim=1).square().sum(-1) / scale**2
+        displaced = observed["ins"][:, :, free].double().cumsum(1) * scenario.arena.dt
+        bent = (found - displaced).diff(n=2, dim=1).square().sum(-1) / scale**2
         likelihood = negative_log_likelihood(error, torch.stack(variances, 1), scale)
         return TensorDict(
             {
@@ -141,7 +145,7 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def _recorded(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Any]:
-    """The belief that a step starts from, and which scenario it is flown in."""
+    """The belief that a step starts from, and which scenario it is of."""
     return {**flat(before), "variant": torch.full(before.batch_size[:1], variant)}
 
 
@@ -151,37 +155,34 @@ def stdcl(
     variants: str = "/".join(VARIANTS),
     agent: str = "stdcl",
     start: str = "none",
-    kernel: int = 3,
+    kernel: Annotated[int, Quantity("steps", 1, 100)] = 3,
     convolutions: bool = True,
-    worlds: int = 4,
-    epochs: int = 10,
-    steps: int = 10,
-    learning_rate: float = 5e-4,
-    last_rate: float = 1e-5,
-    smooth_from: float = 0.7,
+    worlds: Worlds = 4,
+    epochs: Epochs = 10,
+    steps: Steps = 10,
+    learning_rate: Factor = 5e-4,
+    last_rate: Factor = 1e-5,
+    smooth_from: Share = 0.7,
     augment: bool = True,
-    seed: int = 0,
-    score_runs: int = 2,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 2,
 ) -> Training:
-    """ST-DCL's graph network, trained in the closed loop that it flies in.
+    """ST-DCL's graph network, trained in the closed loop that it works in.
 
     In each of ``epochs`` epochs ``worlds`` new worlds of every one of ``variants`` (overrides of
-    ``scenario``, separated by slashes) are flown by ``agent`` (``stdcl`` with any options but
+    ``scenario``, separated by slashes) are run by ``agent`` (``stdcl`` with any options but
     weights, or ``stgat``) with its newest weights; every ``steps`` steps the loss is backpropagated
-    through them. ``start``: weights to begin with, a checkpoint's name or path; else the network
+    through them. ``start``: weights to start from, a checkpoint's name or path; else the network
     is a new one with this ``kernel`` in time, or without ``convolutions``.
     From the share ``smooth_from`` of the epochs on it contains the trajectory's second difference.
     The learning rate falls from ``learning_rate`` to ``last_rate`` along a cosine. ``augment``: the
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
     are compared at the end.
     """
-    at_least("stdcl", 1, worlds=worlds, epochs=epochs, steps=steps, kernel=kernel)
-    at_least("stdcl", 0, score_runs=score_runs, seed=seed)
-    positive("stdcl", learning_rate=learning_rate, last_rate=last_rate)
-    shares("stdcl", smooth_from=smooth_from)
-    scenes = [
+    scenarios = [
         parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
     ]
+    require_batches("stdcl", scenarios, steps)
     name = agent.split(":")[0]
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
@@ -189,56 +190,58 @@ def stdcl(
     network = learned(
         StGnn, start, seed, kernel=kernel, temporal=convolutions, kinematic=name == "stdcl"
     )
-    loops: list[Any] = [make(agent, scene) for scene in scenes]
-    for one in loops:
-        one.learn(network)
+    loops: list[Any] = [make(agent, one) for one in scenarios]
+    for loop in loops:
+        loop.learn(network)
     base = agent if name == "stdcl" else BASE  # untrained, stdcl is its optimizer alone
-    loss = StDclLoss(network, loops, scenes, [_scale(base, scene) for scene in scenes])
+    loss = StDclLoss(network, loops, scenarios, [_scale(base, one) for one in scenarios])
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
-    def launch(epoch: int) -> TakingTurns:
+    def collect(epoch: int) -> RoundRobin:
         share = 0.5 * (1 + math.cos(math.pi * epoch / max(1, epochs - 1)))
         for group in optimizer.param_groups:
             group["lr"] = last_rate + (learning_rate - last_rate) * share
         loss.smooth = _SMOOTH if epoch >= smooth_from * epochs else 0.0
-        first = world_seed(seed, epoch, worlds * len(scenes))
+        first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
-        for i, (loop, scene) in enumerate(zip(loops, scenes, strict=True)):
-            env: Any = CoLocEnv(scene, worlds, seed=first + i * worlds)
+        for i, (loop, one) in enumerate(zip(loops, scenarios, strict=True)):
+            env: Any = CoLocEnv(one, worlds, seed=first + i * worlds)
             if augment:
                 env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i))
-            policy = LocalizerPolicy(loop, scene, record=partial(_recorded, i))
-            collectors.append(fly(env, policy, steps, compact_obs=True))
-        return TakingTurns(collectors)
+            policy = LocalizerPolicy(loop, one, record=partial(_recorded, i))
+            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
+        return RoundRobin(collectors)
 
-    flights = Flights(launch, epochs)
-    trainer = make_trainer(flights, loss, optimizer, clip_norm=1.0)
+    collector = EpochCollector(collect, epochs)
+    trainer = make_trainer(collector, loss, optimizer, clip_norm=1.0)
     return Training(
         module=network,
-        flights=flights,
+        collector=collector,
         trainer=trainer,
         score=partial(score, network, agent, base, score_runs),
     )
 
 
-def _scale(base: str, scene: Scenario) -> float:
+def _scale(base: str, scenario: Scenario) -> float:
     """RMSE (m) of the optimizer alone, after it has settled."""
-    tape = play(make(base, scene), scene, _SCALE_SEED + torch.arange(4), lambda steps: None)
-    return metrics.rmse(tape.error[:, 5:].numpy(), tape.scored[:, 5:].numpy())
+    result = record(make(base, scenario), scenario, _SCALE_SEED + torch.arange(4))
+    return metrics.rmse(result.error[:, 5:], result.worlds.scored[:, 5:])
 
 
-def score(network: StGnn, agent: str, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
+def score(
+    network: StGnn, agent: str, base: str, runs: int, progress: Progress
+) -> Mapping[str, Any]:
     """RMSE (m) of the loop and of its optimizer alone in the worlds of seeds 0 … runs − 1 of
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        scene = parse_scenario(f"swarm-v0:{variant}".rstrip(":"))
-        loop: Any = make(agent, scene)
+        scenario = parse_scenario(f"swarm-v0:{variant}".rstrip(":"))
+        loop: Any = make(agent, scenario)
         loop.learn(network)
         each = {}
-        for name, one in (("trained", loop), ("optimizer", make(base, scene))):
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+        for name, one in (("trained", loop), ("optimizer", make(base, scenario))):
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
-        tell("scoring", len(found), len(SCORED))
+        progress("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found

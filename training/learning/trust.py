@@ -18,19 +18,24 @@ from agents.trust import TrustNetwork
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
+from coloc_env.options import Factor
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
 from training.evaluation import metrics
-from training.evaluation.rollout import play
-from training.learning.collectors import Flights, fly, world_seed
-from training.learning.fleets import TakingTurns
-from training.learning.run import (
-    Progress,
-    Training,
-    at_least,
-    make_trainer,
-    positive,
+from training.evaluation.record import record
+from training.learning.collectors import (
+    EpochCollector,
+    Epochs,
+    RoundRobin,
+    ScoreRuns,
+    Seed,
+    Steps,
+    Worlds,
+    episode_collector,
+    require_batches,
+    world_seed,
 )
+from training.learning.run import Progress, Training, make_trainer
 
 # What the networks meet: each alone, all at once, and nothing at all.
 VARIANTS = (
@@ -69,32 +74,35 @@ def negative_log_likelihood(
 class TrustLoss(LossModule):
     """Mean negative log-likelihood of the positions over a batch's steps.
 
-    The EKF is run again over the batch [B, T], from the belief that its first step was flown with
-    and on the observations that were made, this time with gradients: truncated backpropagation
-    through time. What neighbours said is taken as it was heard.
+    The EKF is run again over the batch [B, T], from the belief that its first step started
+    from and on the observations that were made, this time with gradients: truncated backpropagation
+    through time. Neighbours' messages are taken as they were received.
     """
 
     in_keys = ["uav", "state", "train"]  # noqa: RUF012
     out_keys = ["loss_trust"]  # noqa: RUF012
 
     def __init__(
-        self, network: TrustNetwork, filters: Sequence[CooperativeEkf], scenes: Sequence[Scenario]
+        self,
+        network: TrustNetwork,
+        filters: Sequence[CooperativeEkf],
+        scenarios: Sequence[Scenario],
     ) -> None:
         super().__init__()
         self.network = network
-        self.filters, self.scenes = tuple(filters), tuple(scenes)
+        self.filters, self.scenarios = tuple(filters), tuple(scenarios)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         train = tensordict["train"]
         variant = int(train["variant"][0, 0])
-        ekf, scene = self.filters[variant], self.scenes[variant]
-        n, d = scene.arena.n_uavs, scene.arena.dim
+        ekf, scenario = self.filters[variant], self.scenarios[variant]
+        n, d = scenario.arena.n_uavs, scenario.arena.dim
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
         belief = _belief(train[:, 0])
         losses = []
         for t in range(tensordict.shape[1]):
             seen = tensordict["uav", "observation"][:, t]
-            observation = Observation({name: seen[name] for name in all_leaves(scene)})
+            observation = Observation({name: seen[name] for name in all_leaves(scenario)})
             belief, estimate = ekf.step(belief, observation)
             offset = estimate.position - state[:, t, :, :d]
             losses.append(negative_log_likelihood(offset, estimate.covariance))
@@ -104,7 +112,7 @@ class TrustLoss(LossModule):
 
 
 def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
-    """The belief that a step starts from, and which scenario it is flown in."""
+    """The belief that a step starts from, and which scenario it is of."""
     return {
         "state": before.state,
         "covariance": before.covariance,
@@ -122,69 +130,70 @@ def _belief(entries: TensorDictBase) -> GaussianBelief:
 def trust(
     *,
     scenario: str = "indoor-v0:horizon=100",
-    worlds: int = 16,
-    epochs: int = 8,
-    steps: int = 10,
-    learning_rate: float = 2e-3,
-    seed: int = 0,
-    score_runs: int = 10,
+    worlds: Worlds = 16,
+    epochs: Epochs = 8,
+    steps: Steps = 10,
+    learning_rate: Factor = 2e-3,
+    seed: Seed = 0,
+    score_runs: ScoreRuns = 10,
 ) -> Training:
-    """The trust networks of ``ekf_trust`` and ``pfnn_trust``, through a differentiable EKF.
+    """The trust networks of ``ekf_trust`` and ``pf_trust``, through a differentiable EKF.
 
     In each of ``epochs`` epochs ``worlds`` new worlds of every variant of ``scenario`` (clean,
-    NLOS, false matches, few landmarks, uniform prior, combinations) are flown by ``ekf_trust``
+    NLOS, false matches, few landmarks, uniform prior, combinations) are run by ``ekf_trust``
     with its newest weights; every ``steps`` steps the position's negative log-likelihood is
     backpropagated through them. The learning rate falls linearly to a twentieth.
     ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
     """
-    at_least("trust", 1, worlds=worlds, epochs=epochs, steps=steps)
-    at_least("trust", 0, score_runs=score_runs, seed=seed)
-    positive("trust", learning_rate=learning_rate)
-    scenes = [parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
+    scenarios = [parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
+    require_batches("trust", scenarios, steps)
     network = untrained(TrustNetwork, seed)
-    filters: list[Any] = [make("ekf_trust", scene, weights="none") for scene in scenes]
-    for one in filters:
-        one.learn(network)
-    loss = TrustLoss(network, filters, scenes)
+    filters: list[Any] = [make("ekf_trust", one, weights="none") for one in scenarios]
+    for ekf in filters:
+        ekf.learn(network)
+    loss = TrustLoss(network, filters, scenarios)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
-    def launch(epoch: int) -> Any:
+    def collect(epoch: int) -> RoundRobin:
         share = 1 - 0.95 * epoch / max(1, epochs - 1)
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * share
-        first = world_seed(seed, epoch, worlds * len(scenes))
+        first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
-        for i, (ekf, scene) in enumerate(zip(filters, scenes, strict=True)):
-            env = CoLocEnv(scene, worlds, seed=first + i * worlds)
-            policy = LocalizerPolicy(ekf, scene, record=partial(_record, i))
+        for i, (ekf, one) in enumerate(zip(filters, scenarios, strict=True)):
+            env = CoLocEnv(one, worlds, seed=first + i * worlds)
+            policy = LocalizerPolicy(ekf, one, record=partial(_record, i))
             # ("next", "uav", "observation") is the next step's: half the memory.
-            collectors.append(fly(env, policy, steps, compact_obs=True))
-        return TakingTurns(collectors)
+            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
+        return RoundRobin(collectors)
 
-    flights = Flights(launch, epochs)
-    trainer = make_trainer(flights, loss, optimizer, clip_norm=1.0)
+    collector = EpochCollector(collect, epochs)
+    trainer = make_trainer(collector, loss, optimizer, clip_norm=1.0)
     return Training(
         module=network,
-        flights=flights,
+        collector=collector,
         trainer=trainer,
         score=partial(score, network, scenario.split(":")[0], score_runs),
     )
 
 
-def score(network: TrustNetwork, base: str, runs: int, tell: Progress) -> Mapping[str, Any]:
+def score(network: TrustNetwork, base: str, runs: int, progress: Progress) -> Mapping[str, Any]:
     """RMSE (m) of ``ekf_trust`` and of a Huber EKF over 300 steps of the worlds of seeds
     0 … runs − 1 in some variants."""
     found: dict[str, Any] = {}
     if runs == 0:
         return found
     for variant in SCORED:
-        scene = parse_scenario(f"{base}:horizon=300:{variant}".rstrip(":"))
-        learned: Any = make("ekf_trust", scene, weights="none")
+        scenario = parse_scenario(f"{base}:horizon=300:{variant}".rstrip(":"))
+        learned: Any = make("ekf_trust", scenario, weights="none")
         learned.learn(network)
         each = {}
-        for name, one in (("ekf_trust", learned), ("ekf_huber", make("ekf:robust=huber", scene))):
-            tape = play(one, scene, torch.arange(runs), lambda steps: None)
-            each[f"{name}_rmse"] = metrics.rmse(tape.error.numpy(), tape.scored.numpy())
+        for name, one in (
+            ("ekf_trust", learned),
+            ("ekf_huber", make("ekf:robust=huber", scenario)),
+        ):
+            result = record(one, scenario, torch.arange(runs))
+            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         found[variant or "default"] = each
-        tell("scoring", len(found), len(SCORED))
+        progress("scoring", len(found), len(SCORED))
     return {"runs": runs, "seeds": [0, runs - 1], "steps": 300, "rmse": found}

@@ -7,7 +7,6 @@ their times can be compared pair by pair.
 import json
 import os
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,10 +19,9 @@ from torch.profiler import ProfilerActivity, profile
 from agents.localizer import Localizer
 from agents.registry import make
 from coloc_env.scenario import Scenario
-from coloc_env.world import World
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
-from training.evaluation.rollout import NUMERICAL
+from training.evaluation.rollout import Breakdown, rollout
 from training.reproduce.store import Store
 from training.reproduce.study import Piece, Variant
 
@@ -57,14 +55,14 @@ def measure(
                     team.start()
                 try:
                     spent = team.step()
-                except NUMERICAL:
+                except Breakdown:
                     del teams[name]
                     continue
                 if k >= _WARM_UP:
                     ms[name].append(spent)
             tell("cost", k + 1, _WARM_UP + scenario.horizon)
         return {
-            name: Cost(np.array(ms[name]), team.belief.bytes(), _peak(team))
+            name: Cost(np.array(ms[name]), team.last.belief.bytes(), _peak(team))
             for name, team in teams.items()
         }
 
@@ -96,28 +94,22 @@ class _Team:
     """A team in a world of its own."""
 
     def __init__(self, localizer: Localizer, scenario: Scenario, seed: int) -> None:
-        self.localizer, self.seed, self.world = localizer, seed, World(scenario)
+        self.localizer, self.scenario, self.seeds = localizer, scenario, torch.tensor([seed])
 
     def start(self) -> None:
-        self.observation = self.world.reset(self.seed)
-        self.belief = self.localizer.reset(self.observation)
+        self._steps = rollout(self.localizer, self.scenario, self.seeds)
 
     def step(self) -> float:
         """One step on; the localizer's time in ms."""
-        start = time.perf_counter()
-        belief, estimate = self.localizer.step(self.belief, self.observation)
-        spent = time.perf_counter() - start
-        self.belief = belief
-        self.world.advance(estimate.action())
-        self.observation = self.world.observation()
-        return 1e3 * spent
+        self.last = next(self._steps)
+        return 1e3 * self.last.seconds
 
 
 def _peak(team: _Team) -> int:
     """Bytes allocated at the height of a step, as torch's profiler tells it."""
     with tempfile.TemporaryDirectory() as folder, _no_chatter():
         with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
-            team.localizer.step(team.belief, team.observation)
+            team.localizer.step(team.last.belief, team.last.observation)
         trace = Path(folder) / "trace.json"
         profiler.export_chrome_trace(str(trace))
         events = json.loads(trace.read_text())["traceEvents"]

@@ -3,18 +3,19 @@
 from dataclasses import dataclass
 
 from training.evaluation.metrics import Flags, Floats
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.record import RunRecord
+from training.evaluation.results import Evaluation
 
 
 @dataclass(frozen=True, eq=False)
 class AgentRuns:
     """An agent's runs in a variant."""
 
-    results: Results
+    results: Evaluation
     agent: str
 
     @property
-    def one(self) -> AgentResult:
+    def one(self) -> RunRecord:
         return self.results.agents[self.agent]
 
     @property
@@ -25,4 +26,4 @@ class AgentRuns:
     @property
     def scored(self) -> Flags:
         """[R, K, N]."""
-        return self.results.scored
+        return self.results.worlds.scored

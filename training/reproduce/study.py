@@ -20,8 +20,9 @@ from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bou
 from coloc_env.options import require_known
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
-from training.evaluation.evaluate import Progress, evaluate
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.evaluate import Progress, evaluate, silent
+from training.evaluation.record import RunRecord, Worlds
+from training.evaluation.results import Evaluation
 from training.reproduce.identity import code_of, weights_of
 from training.reproduce.store import Arrays, Store
 
@@ -30,7 +31,6 @@ BOUNDS: dict[str, Callable[[Scenario, int, int], Bound]] = {
     "posterior_bound": posterior_bound,
     "snapshot_bound": snapshot_bound,
 }
-_SERIES = "series."
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _settings(piece: Piece) -> dict[str, Any]:
     }
 
 
-def compute(piece: Piece, store: Store, progress: Progress | None = None) -> None:
+def compute(piece: Piece, store: Store, progress: Progress = silent) -> None:
     """Fly a piece, or compute a bound, and store what came of it."""
     settings = piece.settings()
     scenario, of_world = piece.variant.build(), piece.agent == WORLD
@@ -112,20 +112,12 @@ def compute(piece: Piece, store: Store, progress: Progress | None = None) -> Non
         return
     with_bound = of_world and piece.variant.bounded
     found = evaluate(scenario, [piece.agent], piece.runs, piece.seed, progress, bound=with_bound)
-    one = found.agents[piece.agent]
-    arrays: Arrays = {"offset": one.offset, "nees": one.nees, "broken": one.broken}
-    arrays |= {_SERIES + key: values for key, values in one.series.items()}
+    arrays, facts = found.agents[piece.agent].to_arrays()
     if of_world:
-        arrays |= {"truth": found.truth, "attitude": found.attitude, "scored": found.scored}
+        arrays |= found.worlds.to_arrays()
         if found.bound is not None:
             arrays |= _bound_arrays(found.bound)
-    facts = {
-        "raised": one.raised,
-        "message": one.message,
-        "ms_per_step": one.ms_per_step,
-        "start": found.truth[:, 0].tolist(),
-    }
-    store.save(piece.name, settings, arrays, facts)
+    store.save(piece.name, settings, arrays, facts | {"start": found.worlds.truth[:, 0].tolist()})
 
 
 def _bound_arrays(known: Bound) -> Arrays:
@@ -190,10 +182,10 @@ class Study:
         """Whether the variant's worlds are there."""
         return (variant.key, WORLD) not in self.failed
 
-    def results(self, variant: Variant, agents: Sequence[str], *blocks: int) -> Results:
-        """All agents that did not fail, over all blocks' runs."""
+    def results(self, variant: Variant, agents: Sequence[str], *runs: int) -> Evaluation:
+        """All agents that did not fail, over all blocks of ``runs``."""
         scenario = variant.build()
-        worlds = [self._load(piece) for piece in self.pieces(variant, WORLD, *blocks)]
+        worlds = [self._load(piece) for piece in self.pieces(variant, WORLD, *runs)]
         first = worlds[0][0]
         bound = None
         if "bound_mse" in first:
@@ -202,23 +194,17 @@ class Study:
             )
             bound = Bound(mse, scored, scenario.arena.dt)
         starts = [facts["start"] for _, facts in worlds]
+        met = Worlds.cat([Worlds.from_arrays(self.seed, arrays) for arrays, _ in worlds])
         found = {}
         for agent in agents:
             if (variant.key, agent) in self.failed:
                 continue
-            flown = [self._load(piece) for piece in self.pieces(variant, agent, *blocks)]
-            if [facts["start"] for _, facts in flown] != starts:
+            blocks = [self._load(piece) for piece in self.pieces(variant, agent, *runs)]
+            if [facts["start"] for _, facts in blocks] != starts:
                 raise ValueError(f"{variant.key}: {agent} met other worlds than the bound")
-            found[agent] = _agent_result(flown)
-        return Results(
-            scenario=scenario,
-            seed=self.seed,
-            truth=_joined(worlds, "truth"),
-            attitude=first["attitude"],
-            scored=_joined(worlds, "scored"),
-            bound=bound,
-            agents=found,
-        )
+            parts = [RunRecord.from_arrays(met, arrays, facts) for arrays, facts in blocks]
+            found[agent] = RunRecord.cat(parts, met)
+        return Evaluation(scenario, met, bound, found)
 
     def bound(self, variant: Variant, which: str, runs: int) -> Bound | None:
         """One of ``BOUNDS`` over the first ``runs`` runs; None if it could not be computed."""
@@ -235,26 +221,6 @@ class Study:
 
 
 Loaded = Sequence[tuple[Arrays, dict[str, Any]]]
-
-
-def _agent_result(blocks: Loaded) -> AgentResult:
-    """An agent's blocks of runs as one; errors are the lengths of the offsets."""
-    offset = _joined(blocks, "offset")
-    first, facts = blocks[0]
-    return AgentResult(
-        offset=offset,
-        error=np.linalg.norm(offset.astype(np.float64), axis=-1).astype(np.float32),
-        nees=_joined(blocks, "nees"),
-        broken=_joined(blocks, "broken"),
-        raised=sum(each["raised"] for _, each in blocks),
-        message=next((each["message"] for _, each in blocks if each["message"]), None),
-        series={
-            key.removeprefix(_SERIES): _joined(blocks, key)
-            for key in first
-            if key.startswith(_SERIES) and all(key in arrays for arrays, _ in blocks)
-        },
-        ms_per_step=facts["ms_per_step"],
-    )
 
 
 def _joined(blocks: Loaded, key: str) -> np.ndarray:

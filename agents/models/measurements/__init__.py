@@ -36,6 +36,7 @@ __all__ = [
     "heard",
     "make_measurements",
     "measures",
+    "model_of",
     "nobody",
 ]
 
@@ -77,4 +78,10 @@ def make_measurements(believed: Believed) -> list[Measurement]:
         if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled | InsDriven):
             kind = type(process).__name__
             raise ValueError(f"{name} is about velocity, which {kind} motion does not estimate")
-    return [MODELS[type(s)](s) for s in believed.sensors if type(s) in MODELS]
+    models = ((model_of(type(sensor)), sensor) for sensor in believed.sensors)
+    return [model(sensor) for model, sensor in models if model is not None]
+
+
+def model_of(sensor: type[Sensor]) -> Callable[[Any], Measurement] | None:
+    """The measurement model of a sensor, or of the one it extends; None if there is none."""
+    return next((MODELS[kind] for kind in sensor.__mro__ if kind in MODELS), None)

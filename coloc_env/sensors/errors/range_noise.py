@@ -2,14 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.options import Group, Metres, PositiveMetres, PositiveSeconds, Share
 from coloc_env.sensors.base import Window, require
 from coloc_env.sensors.errors.persistence import held_uniform
+
+NlosKind = Literal["exponential", "constant"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class RangeNoise:
     std: float = 0.2
     nlos: float = 0.0
     nlos_bias: float = 1.0
-    nlos_kind: str = "exponential"
+    nlos_kind: NlosKind = "exponential"
     tail: float = 0.0
     tail_std: float = 1.0
     uniform: float = 0.0
@@ -45,7 +49,7 @@ class RangeNoise:
             require(0 <= getattr(self, name) <= 1, self, name, "a probability in [0, 1]")
         for name in ("std", "nlos_bias", "tail_std", "uniform", "impulse_size"):
             require(0 <= getattr(self, name) < math.inf, self, name, "a size in m ≥ 0")
-        kinds = ("exponential", "constant")
+        kinds = get_args(NlosKind)
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
         lasting = self.nlos_time is None or 0 < self.nlos_time < math.inf
         require(lasting, self, "nlos_time", "a time in s > 0")
@@ -100,3 +104,51 @@ class RangeNoise:
             error = error + torch.where(chance(self.impulse, "impulse"), size, 0.0)
         lost = chance(self.dropout, "dropout") if self.dropout else None
         return error.add_(distance), lost
+
+
+@dataclass(frozen=True)
+class RangeOptions(Group):
+    """Ranges are N(d, ``uwb_std``²); a share ``nlos`` of them has a bias of ``nlos_bias`` m
+    (``nlos_kind``: on average, or exactly), in each step by chance or over ``nlos_time`` s; a share
+    ``uwb_tail`` has noise of ``uwb_tail_std`` m instead; ``uwb_uniform`` m is the half width of a
+    uniform error; a share ``uwb_impulse`` is off by up to ``uwb_impulse_size`` m, and a share
+    ``uwb_dropout`` is missing. The team believes the Gaussian part alone, with
+    ``believed_uwb_std`` m (none: the true one, where the scenario does not say otherwise).
+    """
+
+    title: ClassVar[str] = "UWB ranges"
+
+    uwb_std: Metres = 0.2
+    nlos: Share = 0.0
+    nlos_bias: Metres = 1.0
+    nlos_kind: NlosKind = "exponential"
+    nlos_time: PositiveSeconds | None = None
+    uwb_tail: Share = 0.0
+    uwb_tail_std: Metres = 1.0
+    uwb_uniform: Metres = 0.0
+    uwb_impulse: Share = 0.0
+    uwb_impulse_size: Metres = 10.0
+    uwb_dropout: Share = 0.0
+    believed_uwb_std: PositiveMetres | None = None
+
+    @property
+    def true(self) -> RangeNoise:
+        """The noise that ranges have."""
+        return RangeNoise(
+            std=self.uwb_std,
+            nlos=self.nlos,
+            nlos_bias=self.nlos_bias,
+            nlos_kind=self.nlos_kind,
+            nlos_time=self.nlos_time,
+            tail=self.uwb_tail,
+            tail_std=self.uwb_tail_std,
+            uniform=self.uwb_uniform,
+            impulse=self.uwb_impulse,
+            impulse_size=self.uwb_impulse_size,
+            dropout=self.uwb_dropout,
+        )
+
+    @property
+    def believed(self) -> RangeNoise:
+        """The noise that the team believes in."""
+        return RangeNoise(self.uwb_std if self.believed_uwb_std is None else self.believed_uwb_std)

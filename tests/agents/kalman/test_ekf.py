@@ -30,7 +30,7 @@ def bound() -> float:
 def test_with_fixes_alone_it_is_the_textbook_filter() -> None:
     """In a swarm that measures nothing between its UAVs all is linear: filterpy's Kalman filter,
     one for each UAV, with or without fixes."""
-    scenario = make_scenario("swarm-v0", n_uavs=4, anchors=0.5, anchor_std=8.0)
+    scenario = make_scenario("swarm-v0", n_uavs=4, anchor_share=0.5, anchor_std=8.0)
     own = scenario.sensors[:2]
     scenario = replace(scenario, sensors=own, believed_sensors=own)
     localizer, world = make("ekf", scenario), World(scenario)

@@ -280,7 +280,7 @@ def test_a_kidnapped_robot_is_found_again_after_a_window(tools: SimpleNamespace)
 
 
 def test_before_the_window_is_full_all_memories_are_the_same(tools: SimpleNamespace) -> None:
-    scenario = make_scenario("wsn-v0", dropout=0.2)
+    scenario = make_scenario("wsn-v0", uwb_dropout=0.2)
     seen = tools.play(make("emvf", scenario), scenario, range(5), 6).observations
     short, long = (tools.replay(make("emvf", scenario, memory=m), seen) for m in (3, 6))
     torch.testing.assert_close(short.position[:3], long.position[:3], rtol=0, atol=1e-9)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from agents import make
-from agents.particle import cloud
+from agents.particle import cloud, particle_count
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -305,7 +305,7 @@ def test_guided_particles_have_exact_weights(
     """Drawn from 1.1 × the posterior P, weights are those of N(P) against N(1.1 P): the posterior
     comes out, not 1.1 × it, and of the count M (√(2·1.1 − 1) / 1.1)ᴱ M are effective."""
     world = tools.linear
-    for module in ("ekf", "pf"):
+    for module in ("kalman.ekf", "particle.filter"):
         monkeypatch.setattr(f"agents.{module}.make_measurements", lambda _: [world.fixes])
     seen = fixes(world, 5)
     kalman = tools.replay(make("ekf", world), seen)

@@ -21,13 +21,12 @@ from agents.particle.failure import (
     evidence,
     network_features,
 )
-from agents.weights import learned, load, untrained
+from agents.weights import learned, load, untrained, write
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import AnchorRanging
 from coloc_env.world import World
-from training.learning.checkpoints import write
 
 some = settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -75,7 +74,7 @@ def test_evidence_is_what_numpy_computes(
 ) -> None:
     """d = Σ r² / σ² with the σ that the team believes, over the ranges that arrived."""
     scenario = make_scenario(
-        "wsn-v0", anchors=anchors, n_uavs=2, dropout=dropout, r_believed=std**2
+        "wsn-v0", anchors=anchors, n_uavs=2, uwb_dropout=dropout, believed_uwb_std=std
     )
     truth, seen = sensed(scenario)
     position = (truth[..., :2] + off).float()
@@ -90,7 +89,7 @@ def test_evidence_is_what_numpy_computes(
 
 
 def test_values_behind_the_mask_are_no_evidence() -> None:
-    scenario = make_scenario("wsn-v0", n_uavs=2, dropout=0.5)
+    scenario = make_scenario("wsn-v0", n_uavs=2, uwb_dropout=0.5)
     truth, seen = sensed(scenario)
     mask = seen["anchor_range_mask"]
     assert 0 < mask.mean() < 1
@@ -136,7 +135,7 @@ def test_alarms_at_the_truth_are_as_frequent_as_promised(
     case: int, low: float, high: float
 ) -> None:
     """One in ten, if the team's belief of the ranges is right; otherwise too many or too few."""
-    scenario = make_scenario("wsn-v0", case=case, dropout=0.2)
+    scenario = make_scenario("wsn-v0", case=case, uwb_dropout=0.2)
     truth, seen = sensed(scenario, 3000)
     found = ChiSquare(0.9, 4).probability(looked_at(scenario, truth[..., :2], seen))
     assert low <= found.mean() <= high

@@ -276,7 +276,7 @@ MIXED = (
 @pytest.mark.parametrize("name", MIXED)
 def test_a_row_of_a_batch_is_its_own_run(name: str, tools: SimpleNamespace) -> None:
     """Also where only other rows are begun anew."""
-    scenario = wsn(dropout=0.2)
+    scenario = wsn(uwb_dropout=0.2)
     localizer = hybrid(name, scenario)
     if name.startswith("nn"):
         localizer.learn(judge())
@@ -338,7 +338,7 @@ def test_the_mahalanobis_distance_is_that_of_the_main_filters_estimate(
     tools: SimpleNamespace,
 ) -> None:
     """Before it is begun anew."""
-    scenario = wsn(dropout=0.3)
+    scenario = wsn(uwb_dropout=0.3)
     one, alone = make(f"{ALWAYS}:main=ekf", scenario), make("ekf", scenario)
     run = tools.play(one, scenario, [0, 1], 5)
     for k, seen in enumerate(run.observations):

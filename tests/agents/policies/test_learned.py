@@ -19,7 +19,7 @@ from agents.localizer import Localizer
 from agents.policies.actor import Actor
 from agents.policies.adapters import LocalizerPolicy, ParallelPolicy
 from agents.policies.learned import PolicyAgent, actor_for, inputs_of, mode_of
-from agents.weights import card_of
+from agents.weights import card_of, write
 from agents.wrappers.correction import Correction
 from coloc_env.envs.actions import ActionMode
 from coloc_env.envs.displacement import Displacement
@@ -32,7 +32,6 @@ from coloc_env.scenario import Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import LandmarkBearings, Odometry
 from coloc_env.world import World
-from training.learning import checkpoints
 from training.learning.mappo import policy_of
 
 N, WORLDS = 3, 2
@@ -99,7 +98,7 @@ def test_weights_come_back_from_their_files(name: str, kind: int, tmp_path: Path
     mode = modes(scenario)[kind]
     actor = lively(mode, recurrent=kind > 0, squash="tanh" if kind else "clip")
     file = tmp_path / "mine.safetensors"
-    checkpoints.write(file, actor, {"training": name})
+    write(file, actor, {"training": name})
     drawn = torch.random.get_rng_state()
     agent = make(f"{name}:weights={file}", indoor())
     assert torch.equal(torch.random.get_rng_state(), drawn), (
@@ -132,7 +131,7 @@ def test_an_untrained_policy_needs_no_file_and_hardly_corrects() -> None:
 def saved(tmp_path: Path) -> Path:
     """A good checkpoint, to be spoilt."""
     file = tmp_path / "good.safetensors"
-    checkpoints.write(file, lively(Correction(indoor().believed)), {})
+    write(file, lively(Correction(indoor().believed)), {})
     return file
 
 
@@ -154,12 +153,12 @@ def refused(file: Path | str, words: str, scenario: Scenario | None = None) -> N
 
 
 def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
-    refused("pfnn", "pfnn holds weights of kind 'pfnn': a policy's are needed")
+    refused("pfnn", "pfnn.safetensors holds weights of kind 'pfnn': 'policy' is needed")
     root = Path(__file__).parents[3] / "checkpoints"
     for end in ("safetensors", "json"):
         shutil.copy(root / f"pfnn.{end}", tmp_path / f"mine.{end}")
     file = tmp_path / "mine.safetensors"
-    refused(file, f"{file} holds weights of kind 'pfnn': a policy's are needed")
+    refused(file, f"{file} holds weights of kind 'pfnn': 'policy' is needed")
 
 
 def test_weights_for_other_leaves_are_refused(saved: Path, tmp_path: Path) -> None:
@@ -171,7 +170,7 @@ def test_weights_for_other_leaves_are_refused(saved: Path, tmp_path: Path) -> No
     )
     refused(saved, "this scenario has base_std[2], fix_mean[2], residuals[8], last_act", plane())
     flat = tmp_path / "flat.safetensors"
-    checkpoints.write(flat, lively(Displacement(plane().believed)), {})
+    write(flat, lively(Displacement(plane().believed)), {})
     refused(flat, "was trained on the leaves fix_mean[2], fix_share[1], last_action[2]: this ")
     make(f"mappo:weights={flat}", plane())
 
@@ -219,7 +218,7 @@ def test_a_card_that_describes_no_network_is_refused(saved: Path) -> None:
     kept = json.loads(saved.with_suffix(".json").read_text())
     for wrong in ({}, {"mode": {"name": "displacement"}}, kept["architecture"] | {"depth": 3}):
         edit(saved, architecture=wrong)
-        refused(saved, f"{saved}: its card describes no policy: ")
+        refused(saved, f"{saved}: its card has an architecture that no policy has")
     edit(saved, architecture=kept["architecture"], features=["imu[6]"])
     refused(saved, f"{saved} was trained on the features imu[6]: base_std[3], fix_mean[3], ")
 

@@ -12,7 +12,7 @@ from agents import make
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
-from training.evaluation.agreement import team_figures
+from training.evaluation.team import team_figures
 
 STRANGER = 1
 

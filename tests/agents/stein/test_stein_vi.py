@@ -16,7 +16,7 @@ from agents.models.process import InertialProcess
 from agents.stein.landmarks import sighted
 from agents.stein.stein_vi import SteinViFilter
 from coloc_env.datasets import DataError, load
-from coloc_env.motion import Recorded
+from coloc_env.motion import RecordedMotion
 from coloc_env.observation import Observation
 from coloc_env.scenario import Inertial, Scenario
 from coloc_env.scenarios import make_scenario
@@ -178,11 +178,11 @@ def test_the_imu_is_told_whole() -> None:
     made = euroc(span=(20.0, 24.0))
     sensor = made.sensors[0]
     assert isinstance(sensor, RecordedImu)
-    held = sensor.tape["imu_held"].values[1:, 0].double()
+    held = sensor.series["imu_held"].values[1:, 0].double()
     torch.testing.assert_close(held.sum(-1), torch.full_like(held[:, 0], 0.1), rtol=0, atol=1e-6)
-    samples = sensor.tape["imu_samples"].values[1:, 0].double().unflatten(-1, (-1, 6))
+    samples = sensor.series["imu_samples"].values[1:, 0].double().unflatten(-1, (-1, 6))
     window = preintegration.preintegrate(samples, held, torch.zeros(len(held), 6).double(), 0, 0)
-    mean = sensor.tape["imu"].values[1:, 0].double() * 0.1
+    mean = sensor.series["imu"].values[1:, 0].double() * 0.1
     gained = window.increments[:, 3:6]
     assert (gained - mean[:, :3]).norm(dim=-1).max() < 5e-3
     angle = 2 * window.increments[:, 7:]
@@ -194,12 +194,12 @@ def test_a_second_of_samples_is_more_than_their_mean() -> None:
     force and rate alone 17 cm; after 0.1 s both 1 mm."""
     made = euroc(dt=1.0)
     motion, sensor = made.motion, made.sensors[0]
-    assert isinstance(motion, Recorded)
+    assert isinstance(motion, RecordedMotion)
     assert isinstance(sensor, RecordedImu)
     x = torch.cat([t.values[:, 0] for t in (motion.position, motion.velocity, motion.attitude)], -1)
-    held = sensor.tape["imu_held"].values[1:, 0].double()
-    samples = sensor.tape["imu_samples"].values[1:, 0].double().unflatten(-1, (-1, 6))
-    mean = sensor.tape["imu"].values[1:, :1, :].double()
+    held = sensor.series["imu_held"].values[1:, 0].double()
+    samples = sensor.series["imu_samples"].values[1:, 0].double().unflatten(-1, (-1, 6))
+    mean = sensor.series["imu"].values[1:, :1, :].double()
     left = torch.tensor([0.0301, -0.0424, 0.0036, -0.00005, -0.00074, -0.00021]).double()
     off = []
     for imu, lasting in ((samples, held), (mean, torch.ones_like(held[:, :1]))):

@@ -14,7 +14,7 @@ from coloc_env.world import World
 from training.evaluation.evaluate import evaluate
 from training.evaluation.metrics import rmse
 
-SMALL: dict[str, Any] = {"n_uavs": 40, "anchors": 0.25, "ins_bias": 0.0, "horizon": 25}
+SMALL: dict[str, Any] = {"n_uavs": 40, "anchor_share": 0.25, "ins_bias": 0.0, "horizon": 25}
 PAPERS = "dwmds_st:confidence=paper:v_max=50"
 METHODS = ("dwmds_st", "dwmds_st:window=3", PAPERS, "gn", "map", "mds")
 
@@ -111,7 +111,7 @@ def test_a_world_that_begins_anew_disturbs_no_other(agent: str) -> None:
     [
         {"comm_radius": 1.0},  # nobody hears anybody
         {"comm_radius": 1500.0},  # in pieces, some without an anchor
-        {"anchors": 0.0},
+        {"anchor_share": 0.0},
         {"link_failure": 1.0},
         {"failure_rate": 1.0, "horizon": 4},
     ],
@@ -136,7 +136,7 @@ def test_who_hears_nobody_dead_reckons_and_says_how_unsure_it_is(agent: str) -> 
 
 @pytest.mark.parametrize("agent", ["dwmds_st", "map"])
 def test_without_fixes_nobody_knows_where_all_are_together(agent: str) -> None:
-    scenario = make_scenario("swarm-v0", **SMALL | {"anchors": 0.0, "n_uavs": 12})
+    scenario = make_scenario("swarm-v0", **SMALL | {"anchor_share": 0.0, "n_uavs": 12})
     localizer, world = make(agent, scenario), World(scenario, 1)
     observation = world.reset(2)
     belief = localizer.reset(observation)

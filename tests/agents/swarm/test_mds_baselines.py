@@ -33,7 +33,7 @@ from coloc_env.world import World
 
 STD = 10.0
 METHODS = ("dwmds", "vmds", "fcmds")
-SMALL: dict[str, Any] = {"n_uavs": 30, "anchors": 0.3, "ins_bias": 0.0, "comm_radius": 6000.0}
+SMALL: dict[str, Any] = {"n_uavs": 30, "anchor_share": 0.3, "ins_bias": 0.0, "comm_radius": 6000.0}
 
 
 def team(seed: int, n: int = 14, worlds: int = 2, reach: float = 800.0) -> Prepared:
@@ -395,10 +395,10 @@ def test_they_localize(agent: str) -> None:
     [
         {"comm_radius": 1.0},  # nobody hears anybody
         {"comm_radius": 1500.0},  # in pieces, some without an anchor
-        {"anchors": 0.0},
+        {"anchor_share": 0.0},
         {"link_failure": 1.0},
-        {"n_uavs": 1, "anchors": 0.0},
-        {"n_uavs": 2, "anchors": 0.5},
+        {"n_uavs": 1, "anchor_share": 0.0},
+        {"n_uavs": 2, "anchor_share": 0.5},
         {"failure_rate": 1.0, "horizon": 4},
     ],
     ids=str,
@@ -420,7 +420,7 @@ def test_who_hears_nobody_dead_reckons_and_says_how_unsure_it_is(agent: str) -> 
 
 @pytest.mark.parametrize("agent", METHODS)
 def test_a_team_without_anchors_grows_ever_less_sure(agent: str) -> None:
-    _, _, covariance = flown(agent, anchors=0.0)
+    _, _, covariance = flown(agent, anchor_share=0.0)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     assert (variance.diff(dim=0)[1:] > 0).all()
     assert (variance[-1] >= 2500.0).all()

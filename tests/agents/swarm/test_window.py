@@ -19,7 +19,7 @@ from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
-SMALL: dict[str, Any] = {"n_uavs": 14, "anchors": 0.3, "ins_bias": 0.0, "horizon": 20}
+SMALL: dict[str, Any] = {"n_uavs": 14, "anchor_share": 0.3, "ins_bias": 0.0, "horizon": 20}
 GUIDES, STD, INS, PRIOR, FIX = 4, 10.0, 0.5, 50.0, 0.1  # UAVs; the rest in m and m/s
 PLAIN = "dwmds_st:confidence=none"
 

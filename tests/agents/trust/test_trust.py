@@ -352,7 +352,7 @@ def test_a_range_that_went_around_is_not_trusted_and_honest_ones_are(
         assert weight[mask.scatter(-1, planted, False)].mean() > 0.6
 
 
-@pytest.mark.parametrize(("name", "plain"), [("ekf_trust", "ekf"), ("pfnn_trust", "apf")])
+@pytest.mark.parametrize(("name", "plain"), [("ekf_trust", "ekf"), ("pf_trust", "apf")])
 @pytest.mark.parametrize(
     ("overrides", "share"),
     [({"nlos": 0.3}, 0.8), ({"false_matches": 0.1}, 0.3)],
@@ -371,7 +371,7 @@ def test_trust_beats_none_in_every_world(
 # ---------------------------------------------------------------- options
 
 
-@pytest.mark.parametrize("name", ["ekf_trust", "pfnn_trust"])
+@pytest.mark.parametrize("name", ["ekf_trust", "pf_trust"])
 @pytest.mark.parametrize(
     ("chosen", "words"),
     [

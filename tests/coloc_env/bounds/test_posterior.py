@@ -52,11 +52,11 @@ from coloc_env.sensors import (
     PositionFix,
     RangeNoise,
     Ranging,
-    Recorded,
+    RecordedSensor,
     Sensor,
     UavBearings,
 )
-from coloc_env.series import Tape
+from coloc_env.series import Series
 from coloc_env.world import World
 
 N = 3
@@ -730,16 +730,20 @@ def test_failed_uavs_are_not_scored() -> None:
 
 
 def test_recordings_are_bounded_as_their_sensors_are_described() -> None:
-    """A tape of the world's own leaves gives the world's bound."""
+    """Series of the world's own leaves gives the world's bound."""
     sensors = (Landmarks(4, positions=CORNERS, dropout=0.3), Ranging(RangeNoise(dropout=0.3)))
     task = scenario(*sensors, motion=standing((2, 2, 1), (6, 3, 2), (4, 6, 3)))
     world = World(task, window=20)
     world.reset(0)
     leaves = world.sensed.leaves
     maps = {"landmark_map": world.static["landmark_map"][0, 0]}
-    tapes = [{name: Tape(leaves[name][0]) for name in s.leaves(task.layout)} for s in sensors]
+    series = [{name: Series(leaves[name][0]) for name in s.leaves(task.layout)} for s in sensors]
     recorded = replace(
-        task, sensors=(Recorded(sensors[0], tapes[0], maps), Recorded(sensors[1], tapes[1]))
+        task,
+        sensors=(
+            RecordedSensor(sensors[0], series[0], maps),
+            RecordedSensor(sensors[1], series[1]),
+        ),
     )
     a, b = (posterior_bound(t, 1, steps=20).mse for t in (task, recorded))
     torch.testing.assert_close(a, b)

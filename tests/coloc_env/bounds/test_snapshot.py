@@ -28,7 +28,7 @@ TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.
 
 def team(**overrides: Any) -> Scenario:
     """A swarm, small and, unless told otherwise, fully linked."""
-    chosen: dict[str, Any] = {"n_uavs": 8, "anchors": 0.5, "comm_radius": None, "horizon": 10}
+    chosen: dict[str, Any] = {"n_uavs": 8, "anchor_share": 0.5, "comm_radius": None, "horizon": 10}
     return make_scenario("swarm-v0", **(chosen | overrides))
 
 
@@ -146,7 +146,7 @@ def test_bound_is_the_inverse_of_the_expected_hessian(kind: str) -> None:
     def expected(p: Tensor) -> Tensor:
         shift = (distances(at) - distances(p)).unsqueeze(1)
         ranges = -(weights * log_density(errors + shift)).sum()
-        fixes = 0.5 * ((p - at)[: task.guides] / 0.1).square().sum()
+        fixes = 0.5 * ((p - at)[: task.anchor_uavs] / 0.1).square().sum()
         return ranges + fixes
 
     hessian = torch.autograd.functional.hessian(expected, at).reshape(21, 21)
@@ -276,14 +276,14 @@ def test_a_broken_swarm_is_no_trouble() -> None:
     bound = snapshot_bound(task, 3)
     assert bound.mse.shape == bound.localizable.shape == (3, 20, 40)
     assert not bound.mse.isnan().any()
-    assert not bound.scored[..., : task.guides].any()
+    assert not bound.scored[..., : task.anchor_uavs].any()
     assert 0 < bound.share_localizable < 1
     assert bound.rmse == torch.inf
     assert 3.0 < bound.rmse_localizable < torch.inf
     unlinked = snapshot_bound(make_scenario("swarm-v0", n_uavs=5, comm_radius=1.0), 1, steps=1)
     assert unlinked.share_localizable == 0.0
     assert math.isnan(unlinked.rmse_localizable)
-    nobody = snapshot_bound(team(anchors=0.0), 1, steps=1)
+    nobody = snapshot_bound(team(anchor_share=0.0), 1, steps=1)
     assert nobody.share_localizable == 0.0
 
 
@@ -310,7 +310,7 @@ def test_more_knowledge_lowers_the_bound(better: dict, worse: dict) -> None:
 def efficiency(task: Scenario, runs: int, fit: Any) -> float:
     """Mean squared bound over mean squared error, over worlds of their own."""
     world = World(task, runs)
-    seen, guides = world.reset(torch.arange(runs)), task.guides
+    seen, guides = world.reset(torch.arange(runs)), task.anchor_uavs
     place, ranges = world.truth.position.numpy(), seen["ranges"].double().numpy()
     i, j = np.triu_indices(task.arena.n_uavs, 1)
     free = j >= guides
@@ -359,7 +359,7 @@ def test_maximum_likelihood_comes_near_the_bound_under_nlos() -> None:
 
         return np.asarray(minimize(loss, start, jac=True, method="BFGS", tol=1e-4).x)
 
-    found = efficiency(team(n_uavs=40, anchors=0.8, anchor_std=0.0), 80, fit)
+    found = efficiency(team(n_uavs=40, anchor_share=0.8, anchor_std=0.0), 80, fit)
     assert 0.9 < found < 1.06
 
 

@@ -12,7 +12,7 @@ from agents.policies.learned import actor_for
 from agents.wrappers.correction import with_base
 from coloc_env.envs.per_uav import PerUavEnv
 from coloc_env.envs.torchrl import CoLocEnv
-from training.learning.collectors import fly
+from training.learning.collectors import episode_collector
 from training.learning.mappo import policy_of
 
 B, N, H = 3, 2, 5
@@ -143,7 +143,7 @@ def test_a_collector_flies_a_recurrent_policy(mode: str) -> None:
     with torch.no_grad():
         actor.head.layer.weight[:3] = torch.randn(3, 8)
     options = {"exploration_type": ExplorationType.DETERMINISTIC}
-    batches = [batch.clone() for batch in fly(env, policy_of(actor), 4, **options)]
+    batches = [batch.clone() for batch in episode_collector(env, policy_of(actor), 4, **options)]
     assert [batch.shape for batch in batches] == [torch.Size([B * N, 4])] * 3
     seen: Any = torch.cat(batches, 1)
     assert torch.equal(seen["is_init"][..., 0], (torch.arange(12) == 0).expand(B * N, 12))

@@ -12,11 +12,11 @@ from coloc_env.motion import (
     FormationChange,
     Helix,
     Line,
-    Recorded,
+    RecordedMotion,
     Square,
     StopAndGo,
 )
-from coloc_env.series import Tape
+from coloc_env.series import Series
 
 ROOM = (30.0, 20.0, 5.0)
 
@@ -152,17 +152,19 @@ def test_formations_change_shape_without_collisions(n, fly, arena):
 
 def test_recorded_motion_replays_its_tape_and_then_stays(fly, arena):
     room = arena(*ROOM)
-    tape = fly(Circle(), room, [0], 50)
-    motion = Recorded(Tape(tape.position[0]), Tape(tape.velocity[0]), Tape(tape.attitude[0]))
+    flight = fly(Circle(), room, [0], 50)
+    motion = RecordedMotion(
+        Series(flight.position[0]), Series(flight.velocity[0]), Series(flight.attitude[0])
+    )
     replay = fly(motion, room, [1, 2], 60, window=7, first=[0, 20])
-    assert torch.equal(replay.position[0, :50], tape.position[0])
-    assert torch.equal(replay.velocity[1, :30], tape.velocity[0, 20:])
-    assert torch.equal(replay.attitude[:, -1], tape.attitude[:, -1].expand(2, -1, -1))
+    assert torch.equal(replay.position[0, :50], flight.position[0])
+    assert torch.equal(replay.velocity[1, :30], flight.velocity[0, 20:])
+    assert torch.equal(replay.attitude[:, -1], flight.attitude[:, -1].expand(2, -1, -1))
     with pytest.raises(
-        ValueError, match=r"Recorded: position must be float64 of shape \(50, 5, 3\)"
+        ValueError, match=r"RecordedMotion: position must be float64 of shape \(50, 5, 3\)"
     ):
         fly(motion, arena(*ROOM, n=5), [0], 1)
-    halved = Tape(tape.velocity[0].float())
-    single = Recorded(Tape(tape.position[0]), halved, Tape(tape.attitude[0]))
-    with pytest.raises(ValueError, match="Recorded: velocity must be float64"):
+    halved = Series(flight.velocity[0].float())
+    single = RecordedMotion(Series(flight.position[0]), halved, Series(flight.attitude[0]))
+    with pytest.raises(ValueError, match="RecordedMotion: velocity must be float64"):
         fly(single, room, [0], 1)

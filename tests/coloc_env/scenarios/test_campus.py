@@ -315,7 +315,7 @@ def test_flights_that_do_not_fit_are_refused(motion: Motion, words: str) -> None
 def test_the_campus_is_as_documented() -> None:
     scenario = make_scenario("campus-v0")
     arena = scenario.arena
-    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.guides) == (10, 0.1, 1000, 3)
+    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.anchor_uavs) == (10, 0.1, 1000, 3)
     assert [make_scenario("campus-v0", flight=f).horizon for f in FLIGHTS] == [1200, 1000, 9000]
     assert scenario.network.radius == 400.0
     assert scenario.network.walls == (BUILDING,)
@@ -374,14 +374,14 @@ def test_the_reference_is_as_far_off_as_satellites_are() -> None:
     [
         ({"flight": "s4"}, "flight='s4' is not allowed: one of s1, s2, s3"),
         ({"n_uavs": 1}, "n_uavs=1 is not allowed: at least two UAVs"),
-        ({"dt": 0.0}, "dt=0.0 is not allowed: a time in s > 0"),
-        ({"anchors": 1.0}, r"anchors=1.0 is not allowed: a share in \[0, 1\)"),
-        ({"wall_loss": -1.0}, "wall_loss=-1.0 is not allowed: a loss in dB per metre"),
-        ({"wall_excess": -1.0}, "excess=-1.0 is not allowed: metres per metre of wall"),
-        ({"clock_offset": -1.0}, "offset=-1.0 is not allowed: a standard deviation in m"),
-        ({"clock_skew": -1.0}, "skew=-1.0 is not allowed: an amplitude in m"),
-        ({"gps_cep": -1.0}, "cep=-1.0 is not allowed: a radius in m"),
-        ({"horizon": 0}, "horizon=0 is not allowed: at least one step"),
+        ({"dt": 0.0}, "dt=0.0 is not allowed: a number > 0 in s"),
+        ({"anchor_share": 1.0}, "anchor_uavs=10 is not allowed: from 0 to fewer than the 10 UAVs"),
+        ({"wall_loss": -1.0}, "wall_loss=-1.0 is not allowed: a number ≥ 0 in dB/m"),
+        ({"wall_excess": -1.0}, "wall_excess=-1.0 is not allowed: a number ≥ 0 in m/m"),
+        ({"clock_offset": -1.0}, "clock_offset=-1.0 is not allowed: a number ≥ 0 in m"),
+        ({"clock_skew": -1.0}, "clock_skew=-1.0 is not allowed: a number ≥ 0 in m"),
+        ({"gps_cep": -1.0}, "gps_cep=-1.0 is not allowed: a number ≥ 0 in m"),
+        ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),
     ],
 )
 def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:

@@ -11,10 +11,11 @@ import torch
 from agents.registry import make
 from coloc_env.datasets import DataError, Recording, Table, Track, data_root, load
 from coloc_env.datasets.grid import slots_on
-from coloc_env.motion import Recorded
+from coloc_env.motion import RecordedMotion
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
-from coloc_env.scenarios.replay_anchors import corrected, ranging_grid
+from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.scenarios.parts.tag_replays import corrected, ranging_grid
 from coloc_env.sensors import AnchorRanging, Odometry
 from coloc_env.world import World
 
@@ -63,7 +64,7 @@ def leaves(made: Scenario) -> dict[str, torch.Tensor]:
 
 def rmse(made: Scenario, agent: str, runs: int = 3, after: int = 0) -> float:
     """Over the steps with truth from ``after`` on, in m."""
-    assert isinstance(made.motion, Recorded)
+    assert isinstance(made.motion, RecordedMotion)
     assert made.motion.valid is not None
     localizer, world = make(agent, made), World(made, runs)
     observation, squared = world.reset(0), []
@@ -84,7 +85,7 @@ def test_a_late_range_stays_in_its_step(phase: int) -> None:
     late[::7], late[1::11] = 33, -2
     stamps = np.sort((np.arange(90) * 100 + phase + late) * MS)
     recording = synthetic(stamps)
-    grid = ranging_grid(recording, 0.1, None, margin=0.04)
+    grid = ranging_grid(recording, ReplayOptions(), margin=0.04)
     table = recording.streams["anchor_ranges"][0]
     _, there = slots_on(grid, table, np.zeros(90, np.int64), 1, slice(2, 3))
     assert there.shape[1] == 1
@@ -96,7 +97,7 @@ def test_a_late_range_stays_in_its_step(phase: int) -> None:
 
 def test_span_is_cut() -> None:
     recording = synthetic(np.arange(90) * 100 * MS)
-    grid = ranging_grid(recording, 0.1, (2.0, 5.0), margin=0.04)
+    grid = ranging_grid(recording, ReplayOptions(span=(2.0, 5.0)), margin=0.04)
     assert (grid.start, grid.count) == (2040 * MS, 31)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from coloc_env.datasets import DataError, Recording, load
 from coloc_env.datasets.antenna_arrays import relative_poses
 from coloc_env.geometry import Se3, quaternion_exp
-from coloc_env.motion import Recorded
+from coloc_env.motion import RecordedMotion
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.scenarios.replay_murp import solved
@@ -138,7 +138,7 @@ def test_relative_poses_against_the_motion_capture(trial: str, position: float, 
     whole = recording(trial)
     found = solved(whole, 60)
     motion = scenario(trial).motion
-    assert isinstance(motion, Recorded)
+    assert isinstance(motion, RecordedMotion)
     pose = torch.cat((motion.position.values, motion.attitude.values), -1)
     first, second = torch.tensor(found.pairs).unbind(-1)
     off = Se3.minus(found.pose[60:], Se3.between(pose[:, first], pose[:, second]))

@@ -121,11 +121,11 @@ def test_what_the_team_believes() -> None:
     assert made.process == InsDriven()
     assert made.guides == 2
     assert [type(s) for s in made.believed_sensors] == [Ins, PositionFix, Ranging]
-    made = scenario(process="constant_velocity", velocity_accel_std=0.3, guides=(5, 1, 3))
+    made = scenario(process="constant_velocity", velocity_accel_std=0.3, anchor_robots=(5, 1, 3))
     assert made.process == ConstantVelocity(0.3)
     assert made.guides == 3
     assert [type(s) for s in made.believed_sensors] == [PositionFix, Ranging]
-    raw = scenario(calibrated=False, range_std=0.4, guides=())
+    raw = scenario(calibrated=False, range_std=0.4, anchor_robots=())
     assert raw.guides == 0
     assert raw.believed_sensors[-1].noise.std == 0.4  # type: ignore[attr-defined]
 
@@ -133,9 +133,12 @@ def test_what_the_team_believes() -> None:
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        ({"guides": (2,)}, r"guides=\(2,\) is not allowed: some, not all, of 1, 3, 4, 5"),
-        ({"guides": (1, 3, 4, 5)}, "is not allowed: some, not all"),
-        ({"guides": (5, 5)}, "is not allowed: some, not all"),
+        (
+            {"anchor_robots": (2,)},
+            r"anchor_robots=\(2,\) is not allowed: some, not all, of 1, 3, 4, 5",
+        ),
+        ({"anchor_robots": (1, 3, 4, 5)}, "is not allowed: some, not all"),
+        ({"anchor_robots": (5, 5)}, "is not allowed: some, not all"),
         ({"calibration": -1.0}, "calibration=-1 is not allowed"),
         ({"process": "wheeled"}, "one of ins, constant_velocity"),
         ({"dt": 0.3}, "deliver one pair twice within 0.3 s"),
@@ -162,7 +165,7 @@ def rmse(made: Scenario, agent: str) -> float:
 
 
 def test_ranges_find_a_team_among_three_guides() -> None:
-    made = scenario(span=(60.0, 80.0), guides=(5, 1, 3))
+    made = scenario(span=(60.0, 80.0), anchor_robots=(5, 1, 3))
     assert rmse(made, "map:confidence=huber") < 0.3
     assert rmse(made, "gn") < 0.3
     assert rmse(made, "dead_reckoning") > 0.6
@@ -171,12 +174,12 @@ def test_ranges_find_a_team_among_three_guides() -> None:
 def test_a_prior_on_the_wrong_side_of_the_guides_traps_who_believes_it() -> None:
     """World 0 of a prior of 2 m is told a place 4.5 m off. Another place fits the ranges by far
     better, and the snapshot finds it."""
-    made = scenario(span=(60.0, 80.0), guides=(5, 1, 3), prior_std=2.0)
+    made = scenario(span=(60.0, 80.0), anchor_robots=(5, 1, 3), prior_std=2.0)
     assert rmse(made, "gn") < 0.3
     assert rmse(made, "ekf_joint") > 1.0
 
 
 def test_calibration_pays() -> None:
-    overrides: dict[str, Any] = {"span": (60.0, 80.0), "guides": (5, 1, 3)}
+    overrides: dict[str, Any] = {"span": (60.0, 80.0), "anchor_robots": (5, 1, 3)}
     good, raw = (scenario(calibrated=c, **overrides) for c in (True, False))
     assert rmse(good, "gn") < rmse(raw, "gn")

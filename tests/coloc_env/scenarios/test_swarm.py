@@ -24,7 +24,7 @@ from coloc_env.world import World
 MOTIONS = ["random", "line", "circle", "helix", "weave"]
 TROUBLE: dict[str, Any] = {
     "n_uavs": 10,
-    "anchors": 0.3,
+    "anchor_share": 0.3,
     "layout": "u",
     "nlos": 0.3,
     "nlos_time": 4.0,
@@ -42,7 +42,7 @@ TROUBLE: dict[str, Any] = {
 def test_the_swarm_is_the_papers() -> None:
     scenario = make_scenario("swarm-v0")
     arena = scenario.arena
-    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.guides) == (200, 1.0, 100, 30)
+    assert (arena.n_uavs, arena.dt, scenario.horizon, scenario.anchor_uavs) == (200, 1.0, 100, 30)
     assert (arena.low, arena.high) == ((0.0, 0.0, 0.0), (10e3, 10e3, 5e3))
     assert scenario.network.radius == 5e3
     assert scenario.prior.position_std == 50.0
@@ -67,8 +67,8 @@ def test_the_swarm_is_the_papers() -> None:
 
 
 def test_without_anchors_nobody_has_a_fix() -> None:
-    scenario = make_scenario("swarm-v0", anchors=0.0)
-    assert scenario.guides == 0
+    scenario = make_scenario("swarm-v0", anchor_share=0.0)
+    assert scenario.anchor_uavs == 0
     assert "position_fix" not in all_leaves(scenario)
 
 
@@ -194,7 +194,7 @@ def test_guides_are_spread_over_the_groups_of_a_weave() -> None:
 
 
 def test_guides_know_where_they_are_and_are_not_scored() -> None:
-    world = World(make_scenario("swarm-v0", n_uavs=10, anchors=0.3), 50)
+    world = World(make_scenario("swarm-v0", n_uavs=10, anchor_share=0.3), 50)
     seen = world.reset(0)
     mask = seen["position_fix_mask"][..., 0]
     assert torch.equal(mask, (torch.arange(10) < 3).float().expand(50, 10))
@@ -210,7 +210,7 @@ def test_guides_know_where_they_are_and_are_not_scored() -> None:
 
 @pytest.mark.parametrize("reward", REWARDS)
 def test_guides_earn_nothing_and_say_so(reward: str) -> None:
-    env = parallel_env("swarm-v0", n_uavs=4, anchors=0.5, horizon=3, reward=reward)
+    env = parallel_env("swarm-v0", n_uavs=4, anchor_share=0.5, horizon=3, reward=reward)
     _, infos = env.reset(seed=0)
     assert {info["scored"] for info in infos.values()} == {0.0}
     still = {agent: np.zeros(9, np.float32) for agent in env.agents}
@@ -225,7 +225,7 @@ def test_guides_earn_nothing_and_say_so(reward: str) -> None:
 
 
 def test_the_bound_is_that_of_those_who_are_scored() -> None:
-    bound = posterior_bound(make_scenario("swarm-v0", n_uavs=6, anchors=0.5), 2, steps=5)
+    bound = posterior_bound(make_scenario("swarm-v0", n_uavs=6, anchor_share=0.5), 2, steps=5)
     assert torch.equal(bound.scored, (torch.arange(6) >= 3).expand(2, 5, 6))
     assert bound.mse[..., :3].max() < 3 * 0.1**2 + 1e-9
     assert bound.mse[..., 3:].min() > 3 * 0.1**2
@@ -237,13 +237,13 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: at least one UAV"),
-        ({"dt": 0.0}, r"dt \(s\) and the sides of size \(m\) must be > 0"),
-        ({"size": (1e3, 1e3, 0.0)}, r"dt \(s\) and the sides of size \(m\) must be > 0"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"dt": 0.0}, "dt=0.0 is not allowed: a number > 0 in s"),
+        ({"size": (1e3, 1e3, 0.0)}, "size=.* is not allowed: 3 numbers > 0 in m"),
         ({"size": (1e3, 1e3)}, "size=.* is not allowed: 3 numbers"),
         ({"layout": "w"}, "layout='w' is not allowed: one of random, u, o"),
         ({"motion": "zigzag"}, "motion='zigzag' .*: one of random, line, circle, helix, weave"),
-        ({"v_max": 0.0}, "v_max=0.0 is not allowed: a speed in m/s > 0"),
+        ({"v_max": 0.0}, "v_max=0.0 is not allowed: a number > 0 in m/s"),
         (
             {"motion": "circle", "v_max": 150.0, "layout": "u"},
             r"v_max=150.0 is not allowed with motion='circle': .* 1500 m .* room for 1499.5 m",
@@ -252,19 +252,19 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
             {"motion": "weave", "size": (300.0, 150.0, 100.0)},
             "v_max=50.0 is not allowed with motion='weave': .* 177.083 m .* room for 74.5 m",
         ),
-        ({"anchors": 1.0}, r"anchors=1.0 is not allowed: a share in \[0, 1\)"),
-        ({"anchors": -0.1}, r"anchors=-0.1 is not allowed: a share in \[0, 1\)"),
-        ({"anchors": 0.9, "n_uavs": 3}, "guides=3 is not allowed: from 0 to fewer than the 3"),
-        ({"anchor_std": -1.0}, "std=-1.0 is not allowed: a standard deviation in m"),
-        ({"nlos_time": 0.0}, "nlos_time=0.0 is not allowed: a time in s > 0"),
-        ({"ins_bias": -1.0}, "bias=-1.0 is not allowed: a standard deviation in m/s"),
-        ({"ins_bias_time": 0.0}, "bias_time=0.0 is not allowed: a time in s > 0"),
-        ({"link_failure": 1.5}, "failure=1.5 is not allowed: a probability"),
-        ({"failure_rate": 1.5}, "failure_rate=1.5 is not allowed: a probability"),
-        ({"comm_radius": 0.0}, "radius=0.0 is not allowed: a distance in m > 0"),
-        ({"horizon": 0}, "horizon=0 is not allowed: at least one step"),
+        ({"anchor_share": 1.1}, "anchor_share=1.1 is not allowed: a number from 0 to 1"),
+        ({"anchor_share": -0.1}, "anchor_share=-0.1 is not allowed: a number from 0 to 1"),
+        ({"anchor_share": 0.9, "n_uavs": 3}, "anchor_uavs=3 is not allowed: .* fewer than the 3"),
+        ({"anchor_std": -1.0}, "anchor_std=-1.0 is not allowed: a number ≥ 0 in m"),
+        ({"nlos_time": 0.0}, "nlos_time=0.0 is not allowed: a number > 0 in s or none"),
+        ({"ins_bias": -1.0}, "ins_bias=-1.0 is not allowed: a number ≥ 0 in m/s"),
+        ({"ins_bias_time": 0.0}, "ins_bias_time=0.0 is not allowed: a number > 0 in s"),
+        ({"link_failure": 1.5}, "link_failure=1.5 is not allowed: a number from 0 to 1"),
+        ({"failure_rate": 1.5}, "failure_rate=1.5 is not allowed: a number from 0 to 1"),
+        ({"comm_radius": 0.0}, "comm_radius=0.0 is not allowed: a number > 0 in m or none"),
+        ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),
         ({"reward": "best"}, "reward='best' is not allowed"),
-        ({"anchor": 0.3}, r"unknown option 'anchor' \(did you mean 'anchors'\?\)"),
+        ({"anchors": 0.3}, "unknown option 'anchors' .*; known: .*anchor_share, anchor_std"),
     ],
 )
 def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:

@@ -111,7 +111,7 @@ def test_several_robots_share_the_square_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("r", [1e-4, 0.04, 0.5])
 def test_ranges_have_the_true_variance_and_no_bias(r: float) -> None:
-    error, there = errors(r_true=r)
+    error, there = errors(uwb_std=r**0.5)
     count = error.numel()
     assert there.all()
     assert abs(float(error.mean())) < 4 * (r / count) ** 0.5
@@ -151,11 +151,11 @@ def test_some_ranges_to_all_anchors_are_long() -> None:
 
 
 def test_ranges_are_lost_one_by_one() -> None:
-    _, there = errors(dropout=0.2)
+    _, there = errors(uwb_dropout=0.2)
     count = there.numel()
     assert float(there.double().mean()) == pytest.approx(0.8, abs=4 * (0.16 / count) ** 0.5)
     assert len(there.flatten(0, 2).unique(dim=0)) == 16
-    scenario = make_scenario("wsn-v0", dropout=0.2)
+    scenario = make_scenario("wsn-v0", uwb_dropout=0.2)
     _, ranges, mask = flown(scenario, [0], 60)
     assert not ranges[mask == 0].any()
 
@@ -179,13 +179,15 @@ def test_cases_differ_in_belief_alone(case: int) -> None:
 
 def test_beliefs_and_truth_are_set_apart() -> None:
     for case in BELIEVED:
-        scenario = make_scenario("wsn-v0", case=case, r_true=0.3, r_believed=0.5, q=0.7)
+        scenario = make_scenario(
+            "wsn-v0", case=case, uwb_std=0.3**0.5, believed_uwb_std=0.5**0.5, q=0.7
+        )
         true, believed = ranging(scenario)
         assert (true.noise.std**2, believed.noise.std**2) == pytest.approx((0.3, 0.5))
         process = scenario.believed.process
         assert isinstance(process, ConstantVelocity)
         assert process.accel_std**2 == pytest.approx(0.7)
-    troubled = make_scenario("wsn-v0", nlos_anchor=1, nlos=0.2, dropout=0.1)
+    troubled = make_scenario("wsn-v0", nlos_anchor=1, nlos=0.2, uwb_dropout=0.1)
     assert troubled.believed == make_scenario("wsn-v0").believed
 
 
@@ -235,18 +237,18 @@ def test_everyone_is_carried_across_the_room() -> None:
         ({"case": "2"}, "case='2' is not allowed: one of 1, 2, 3"),
         ({"anchors": 0}, "anchors=0 is not allowed: 1 to 8"),
         ({"anchors": 9}, "anchors=9 is not allowed: 1 to 8"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: at least one UAV"),
-        ({"horizon": 0}, "horizon=0 is not allowed: at least one step"),
-        ({"r_true": 0.0}, "r_true and r_believed are variances in m² > 0"),
-        ({"r_believed": -0.1}, "r_true and r_believed are variances in m² > 0"),
-        ({"q": -1.0}, "q=-1.0 is not allowed: a variance in m²/s⁴ ≥ 0"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),
+        ({"uwb_std": -0.1}, "uwb_std=-0.1 is not allowed: a number ≥ 0 in m is needed"),
+        ({"believed_uwb_std": 0.0}, "believed_uwb_std=0.0 is not allowed: a number > 0 in m or"),
+        ({"q": -1.0}, "q=-1.0 is not allowed: a number ≥ 0 in m²/s⁴ or none is needed"),
         ({"nlos_anchor": 4}, r"blocked=\(4,\) is not allowed: indices of the 4 anchors"),
         ({"nlos_anchor": 2, "anchors": 2}, "indices of the 2 anchors"),
-        ({"nlos_anchor": -1}, "indices of the 4 anchors"),
+        ({"nlos_anchor": -1}, "nlos_anchor=-1 is not allowed: a whole number ≥ 0 or none"),
         ({"nlos_kind": "odd"}, "nlos_kind='odd' is not allowed: one of exponential, constant"),
-        ({"nlos": 1.5}, "nlos=1.5 is not allowed: a probability"),
-        ({"dropout": -0.1}, "dropout=-0.1 is not allowed: a probability"),
-        ({"max_speed": 0.0}, "max_speed=0.0 is not allowed: a speed > 0"),
+        ({"nlos": 1.5}, "nlos=1.5 is not allowed: a number from 0 to 1"),
+        ({"uwb_dropout": -0.1}, "uwb_dropout=-0.1 is not allowed: a number from 0 to 1"),
+        ({"max_speed": 0.0}, "max_speed=0.0 is not allowed: a number > 0 in m/s"),
         ({"kidnap_at": 0.0}, "kidnap_at=0.0 is not allowed"),
         ({"kidnap_at": float("inf")}, "kidnap_at=inf is not allowed"),
         ({"reward": "best"}, "reward='best' is not allowed"),
@@ -270,7 +272,7 @@ def truth(env: CoLocParallelEnv) -> dict[str, np.ndarray]:
     return {a: np.concatenate((r[:4], surely)) for a, r in zip(env.agents, rows, strict=True)}
 
 
-@pytest.mark.parametrize("overrides", [{}, {"n_uavs": 3, "dropout": 0.2, "case": 2}], ids=str)
+@pytest.mark.parametrize("overrides", [{}, {"n_uavs": 3, "uwb_dropout": 0.2, "case": 2}], ids=str)
 def test_both_faces_work(overrides: dict[str, Any]) -> None:
     parallel_api_test(parallel_env("wsn-v0", horizon=12, **overrides), num_cycles=30)
     parallel_seed_test(lambda: parallel_env("wsn-v0", horizon=12, **overrides))
@@ -293,7 +295,7 @@ TROUBLE: dict[str, Any] = {
     "n_uavs": 2,
     "nlos": 0.1,
     "nlos_anchor": 1,
-    "dropout": 0.2,
+    "uwb_dropout": 0.2,
     "kidnap_at": 20.0,
 }
 

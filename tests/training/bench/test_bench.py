@@ -59,7 +59,7 @@ def test_an_unwritable_folder_is_refused_before_anything_is_measured(tmp_path: P
         ("apf", {"noise", "likelihood", "weights", "moments", "resampling"}),
         ("pfnn", {"noise", "likelihood", "weights", "resampling", "corrector network"}),
         ("apf:proposal=ekf", {"noise", "likelihood", "weights", "proposal", "Gaussian update"}),
-        ("pfnn_trust", {"likelihood", "Gaussian update", "trust features", "trust networks"}),
+        ("pf_trust", {"likelihood", "Gaussian update", "trust features", "trust networks"}),
     ],
 )
 def test_the_time_of_a_step_is_put_down_to_its_parts(name: str, parts: set[str]) -> None:

@@ -6,6 +6,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from training.cli.command import app
+from training.evaluation.results import typed
+from training.learning.registry import TRAININGS
 
 SMALL = ["--set", "scenario=indoor-v0:n_uavs=2:horizon=20", "--set", "worlds=1"]
 SMALL += ["--set", "epochs=1", "--set", "score_runs=1"]
@@ -21,6 +23,18 @@ def test_teaches() -> None:
     assert "learning_rate" in shown
     assert "one of offline, online" in shown
     assert "coloc train --resume" in train("--help").stdout
+
+
+@pytest.mark.parametrize("name", TRAININGS)
+def test_lists_every_option_with_what_is_allowed_and_its_default(name: str) -> None:
+    shown = train(name).stdout
+    for key, option in TRAININGS.options_of(name).items():
+        line = [line for line in shown.splitlines() if line.split(" ")[0] == key][-1]
+        assert option.words.split(" ")[0] in line
+        if isinstance(option.default, int | float):  # texts may be broken into lines
+            assert typed(option.default) in line
+        if option.annotation is not str:
+            assert option.words != "a name"
 
 
 def test_trains_resumes_and_serves(tmp_path: Path) -> None:
@@ -43,9 +57,16 @@ def test_trains_resumes_and_serves(tmp_path: Path) -> None:
         (["pfnm", "--out", "x"], "did you mean 'pfnn'"),
         (["pfnm"], "did you mean 'pfnn'"),
         (["pfnn", "--out", "x", "--set", "epochs"], "key=value"),
-        (["pfnn", "--out", "x", "--set", "epochs=many"], "a whole number is needed"),
+        (
+            ["pfnn", "--out", "x", "--set", "epochs=many"],
+            "a whole number from 1 to 100000",
+        ),
         (["pfnn", "--set", "epochs=3"], "--out DIR is needed"),
-        (["pfnn", "--out", "x", "--threads", "0"], "--threads 0"),
+        (["pfnn", "--out", "x", "--threads", "0"], "--threads 0 is not allowed: 1 to"),
+        (["pfnn", "--out", "x", "--threads", "100000"], "--threads 100000 is not allowed: 1 to"),
+        (["trust", "--out", "x", "--set", "steps=101"], "steps=101 is not allowed: at most 100"),
+        (["trust", "--out", "x", "--set", "steps=301"], "steps=301 is not allowed: at most 100"),
+        (["stdcl", "--out", "x", "--set", "steps=61"], "steps=61 is not allowed: at most 60"),
         (["--resume", "no/where"], "no/where holds no run"),
         (["pfnn", "--resume", "no/where"], "--resume goes alone"),
     ],

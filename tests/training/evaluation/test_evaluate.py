@@ -15,7 +15,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from training.evaluation import metrics
 from training.evaluation.evaluate import evaluate
-from training.evaluation.results import Results
+from training.evaluation.results import Evaluation
 
 FIGURES = [
     "rmse",
@@ -39,7 +39,7 @@ def scenario(**overrides: object) -> Scenario:
     return make_scenario("indoor-v0", **{"n_uavs": 3, "horizon": 120} | overrides)
 
 
-def timeless(results: Results) -> dict[str, Any]:
+def timeless(results: Evaluation) -> dict[str, Any]:
     """The summary without its times."""
     summary = copy.deepcopy(results.summary)
     for figures in summary["agents"].values():
@@ -48,11 +48,11 @@ def timeless(results: Results) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def results(localizers: None) -> Results:
+def results(localizers: None) -> Evaluation:
     return evaluate(scenario(), AGENTS, runs=4, seed=10)
 
 
-def test_schema(results: Results) -> None:
+def test_schema(results: Evaluation) -> None:
     summary = json.loads(json.dumps(results.summary, allow_nan=False))
     assert list(summary) == ["scenario", "overrides", "seed", "runs", "steps", "bound", "agents"]
     assert (summary["scenario"], summary["seed"], summary["runs"]) == ("indoor-v0", 10, 4)
@@ -68,7 +68,7 @@ def test_schema(results: Results) -> None:
         assert isinstance(figures["diverged_runs"], int)
 
 
-def test_figures_by_numpy(results: Results) -> None:
+def test_figures_by_numpy(results: Evaluation) -> None:
     for name, figures in results.summary["agents"].items():
         error = results.agents[name].error.astype(np.float64)
         squares = error**2
@@ -95,14 +95,14 @@ def test_figures_by_numpy(results: Results) -> None:
     assert results.summary["agents"]["dead_reckoning"]["avg_particles"] is None
 
 
-def test_bound_is_of_the_same_worlds(results: Results) -> None:
+def test_bound_is_of_the_same_worlds(results: Evaluation) -> None:
     known = posterior_bound(scenario(), runs=4, seed=10)
     assert results.summary["bound"]["rmse"] == pytest.approx(known.rmse)
 
 
-def test_worlds_are_paired(results: Results) -> None:
+def test_worlds_are_paired(results: Evaluation) -> None:
     alone = evaluate(scenario(), AGENTS[1:2], runs=2, seed=11, bound=False)
-    np.testing.assert_array_equal(alone.truth, results.truth[1:3])
+    np.testing.assert_array_equal(alone.worlds.truth, results.worlds.truth[1:3])
     np.testing.assert_array_equal(
         alone.agents["test_still"].error, results.agents["test_still"].error[1:3]
     )
@@ -110,12 +110,12 @@ def test_worlds_are_paired(results: Results) -> None:
     assert alone.summary["agents"]["test_still"]["ratio_to_bound"] is None
 
 
-def test_same_seed_same_results_in_any_chunks(results: Results) -> None:
+def test_same_seed_same_results_in_any_chunks(results: Evaluation) -> None:
     assert timeless(evaluate(scenario(), AGENTS, runs=4, seed=10)) == timeless(results)
     assert timeless(evaluate(scenario(), AGENTS, runs=4, seed=10, chunk=3)) == timeless(results)
 
 
-def test_paired_difference(results: Results) -> None:
+def test_paired_difference(results: Evaluation) -> None:
     a, b = (
         np.sqrt((results.agents[name].error.astype(np.float64) ** 2).mean((1, 2)))
         for name in AGENTS[1:]
@@ -140,7 +140,7 @@ def test_diverged_runs_are_counted_and_kept() -> None:
     assert lost == [False, True, False, False]
     assert [figures[name]["diverged_runs"] for name in names] == [0, 3, 3, 3]
     assert figures[names[3]]["diagnostics"]["raised_runs"] == 3
-    assert results.agents[names[3]].message == "step 59: RuntimeError: the matrix is singular"
+    assert results.agents[names[3]].messages[0] == "step 59: RuntimeError: the matrix is singular"
     for name in names:
         assert results.agents[name].error.shape == (3, 60, 3)
         assert math.isfinite(figures[name]["rmse"])
@@ -162,7 +162,7 @@ def test_figures_that_do_not_apply_are_null() -> None:
 
 def test_errors_are_measured_from_the_reference_too() -> None:
     """A UAV that says just what its reference does has no error from it; the truth has."""
-    scene = make_scenario("campus-v0", n_uavs=4, anchors=0.0, horizon=8, gps_cep=2.0)
+    scene = make_scenario("campus-v0", n_uavs=4, anchor_share=0.0, horizon=8, gps_cep=2.0)
     results = evaluate(scene, ["dead_reckoning"], runs=2, seed=5, bound=False)
     (agent,) = results.agents.values()
     assert results.reference is not None

@@ -11,16 +11,19 @@ from PIL import Image
 
 from coloc_env.bounds import Bound
 from training.evaluation.figures import consistency, draw, error_over_time, trajectories
-from training.evaluation.results import FIGURES, Results
+from training.evaluation.record import RunRecord, Worlds
+from training.evaluation.results import FIGURES, Evaluation
 
 
-def bounded(results: Results) -> Results:
-    mse = torch.full(results.scored.shape, 0.01, dtype=torch.float64)
-    return dataclasses.replace(results, bound=Bound(mse, torch.from_numpy(results.scored), 0.1))
+def bounded(results: Evaluation) -> Evaluation:
+    mse = torch.full(results.worlds.scored.shape, 0.01, dtype=torch.float64)
+    return dataclasses.replace(
+        results, bound=Bound(mse, torch.from_numpy(results.worlds.scored), 0.1)
+    )
 
 
 @pytest.mark.filterwarnings("error")
-def test_all_figures(made_up: Results, tmp_path: Path) -> None:
+def test_all_figures(made_up: Evaluation, tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
     draw(bounded(made_up), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FIGURES)
@@ -31,34 +34,30 @@ def test_all_figures(made_up: Results, tmp_path: Path) -> None:
     assert dict(mpl.rcParams) == before
 
 
-def test_one_step_one_run_one_agent(made_up: Results, tmp_path: Path) -> None:
+def test_one_step_one_run_one_agent(made_up: Evaluation, tmp_path: Path) -> None:
     agent = made_up.agents["bad"]
-    small = dataclasses.replace(
-        made_up,
-        scenario=dataclasses.replace(made_up.scenario, horizon=1),
-        truth=made_up.truth[:1, :1],
-        attitude=made_up.attitude[:1],
-        scored=made_up.scored[:1, :1],
-        agents={
-            "bad": dataclasses.replace(
-                agent,
-                offset=agent.offset[:1, :1],
-                error=agent.error[:1, :1],
-                nees=agent.nees[:1, :1],
-            )
-        },
+    worlds = Worlds(
+        made_up.seed,
+        made_up.worlds.truth[:1, :1],
+        made_up.worlds.attitude[:1],
+        made_up.worlds.scored[:1, :1],
     )
+    few = (agent.offset[:1, :1], agent.error[:1, :1], agent.nees[:1, :1], agent.broken[:1])
+    scenario = dataclasses.replace(made_up.scenario, horizon=1)
+    small = Evaluation(scenario, worlds, None, {"bad": RunRecord(worlds, *few)})
     draw(small, tmp_path)
 
 
-def test_nothing_to_show(made_up: Results, tmp_path: Path) -> None:
-    draw(dataclasses.replace(made_up, scored=np.zeros_like(made_up.scored)), tmp_path)
+def test_nothing_to_show(made_up: Evaluation, tmp_path: Path) -> None:
+    nothing = np.zeros_like(made_up.worlds.scored)
+    worlds = dataclasses.replace(made_up.worlds, scored=nothing)
+    draw(dataclasses.replace(made_up, worlds=worlds), tmp_path)
 
 
-def test_lines_show_the_numbers(made_up: Results) -> None:
+def test_lines_show_the_numbers(made_up: Evaluation) -> None:
     results = bounded(made_up)
     good, _, bound = (line.get_ydata() for line in error_over_time(results).axes[0].lines)
-    error, scored = results.agents["good:weights=a/b"].error, results.scored
+    error, scored = results.agents["good:weights=a/b"].error, results.worlds.scored
     assert np.asarray(good)[0] == pytest.approx(np.sqrt((error[:, 0] ** 2).mean()))
     assert np.asarray(good)[6] == pytest.approx(np.sqrt((error[1, 6] ** 2).mean()))
     np.testing.assert_allclose(np.asarray(bound, float), 0.1)

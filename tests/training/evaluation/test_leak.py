@@ -10,7 +10,7 @@ import torch
 from agents import make
 from agents.weights import card_of
 from coloc_env.scenarios import make_scenario, parse_scenario
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 
 POLICIES = ("mappo", "ippo", "sb3-ppo")
 _SCENARIO = {"motion": "random", "horizon": 100}
@@ -19,8 +19,8 @@ _SCENARIO = {"motion": "random", "horizon": 100}
 def error(agent: str, seeds: int = 8, **overrides: float) -> float:
     """Mean error (m) from step 20 on."""
     scenario = make_scenario("indoor-v0", **_SCENARIO, **overrides)
-    tape = play(make(agent, scenario), scenario, torch.arange(seeds), lambda steps: None)
-    return float(tape.error[:, 20:].mean())
+    found = record(make(agent, scenario), scenario, torch.arange(seeds))
+    return float(found.error[:, 20:].mean())
 
 
 @pytest.mark.parametrize("name", POLICIES)

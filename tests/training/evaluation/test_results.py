@@ -15,7 +15,7 @@ from training.evaluation.results import (
     COLUMNS,
     FIGURES,
     NAMES,
-    Results,
+    Evaluation,
     csv_text,
     markdown,
     rows,
@@ -28,7 +28,13 @@ def refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is not JSON")
 
 
-def test_folder(made_up: Results, tmp_path: Path) -> None:
+def unscored(results: Evaluation) -> Evaluation:
+    """The same with nothing to score."""
+    nothing = np.zeros_like(results.worlds.scored)
+    return dataclasses.replace(results, worlds=dataclasses.replace(results.worlds, scored=nothing))
+
+
+def test_folder(made_up: Evaluation, tmp_path: Path) -> None:
     write(made_up, tmp_path, figures=False)
     assert {path.name for path in tmp_path.iterdir()} == set(NAMES) - set(FIGURES)
     text = (tmp_path / "results.json").read_text(encoding="utf-8")
@@ -40,8 +46,8 @@ def test_folder(made_up: Results, tmp_path: Path) -> None:
     assert summary["agents"]["good:weights=a/b"]["diverged_runs"] == 0
 
 
-def test_what_is_not_finite_is_null(made_up: Results) -> None:
-    nothing = dataclasses.replace(made_up, scored=np.zeros_like(made_up.scored))
+def test_what_is_not_finite_is_null(made_up: Evaluation) -> None:
+    nothing = unscored(made_up)
     figures = json.loads(json.dumps(nothing.summary, allow_nan=False))["agents"]["bad"]
     assert figures["rmse"] is None
     assert figures["median"] is None
@@ -50,7 +56,7 @@ def test_what_is_not_finite_is_null(made_up: Results) -> None:
     assert figures["diverged_runs"] == 0
 
 
-def test_csv(made_up: Results) -> None:
+def test_csv(made_up: Evaluation) -> None:
     lines = list(csv.DictReader(io.StringIO(csv_text(made_up))))
     assert [line["agent"] for line in lines] == list(made_up.agents)
     for line in lines:
@@ -61,7 +67,7 @@ def test_csv(made_up: Results) -> None:
         assert float(line["ate"]) == figures["diagnostics"]["ate"]
 
 
-def test_markdown(made_up: Results) -> None:
+def test_markdown(made_up: Evaluation) -> None:
     text = markdown(made_up)
     assert text.startswith("# made-up: 2 runs of 30 steps of 0.1 s, seeds 7 to 8\n")
     tables = [line for line in text.splitlines() if line.startswith("|")]
@@ -71,22 +77,22 @@ def test_markdown(made_up: Results) -> None:
     assert rows(made_up, ["rmse_after_10s", "ms_per_step"])[0][1:] == ["–", "1.5"]
 
 
-def test_a_method_that_raises_is_named(made_up: Results) -> None:
-    bad = dataclasses.replace(made_up.agents["bad"], raised=1, message="step 3: it broke")
-    told = dataclasses.replace(made_up, agents={"bad": bad})
-    assert "`bad` raised in 1 of 2 runs; the first at step 3: it broke" in markdown(told)
+def test_a_method_that_raises_is_named(made_up: Evaluation) -> None:
+    bad = dataclasses.replace(made_up.agents["bad"], messages=("step 3: it broke",))
+    named = dataclasses.replace(made_up, agents={"bad": bad})
+    assert "`bad` raised in 1 of 2 runs; the first at step 3: it broke" in markdown(named)
 
 
-def test_tum_files_hold_scored_steps(made_up: Results, tmp_path: Path) -> None:
+def test_tum_files_hold_scored_steps(made_up: Evaluation, tmp_path: Path) -> None:
     write(made_up, tmp_path, figures=False)
     folders = ["bad", "good-weights=a_b", "groundtruth"]
     assert sorted(path.name for path in (tmp_path / "tum").iterdir()) == folders
     dim = made_up.scenario.arena.dim
     for i in range(3):
-        now = made_up.scored[0, :, i]
+        now = made_up.worlds.scored[0, :, i]
         for folder, name in zip(folders, ("bad", "good:weights=a/b", None), strict=True):
             table = np.loadtxt(tmp_path / "tum" / folder / f"uav_{i}.txt")
-            position = made_up.truth[0, now, i]
+            position = made_up.worlds.truth[0, now, i]
             if name is not None:
                 position = position + made_up.agents[name].offset[0, now, i]
             assert table.shape == (now.sum(), 8)

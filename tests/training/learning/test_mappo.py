@@ -19,7 +19,7 @@ from agents import make
 from agents.policies.actor import Actor
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning import mappo
 from training.learning import run as runs
 from training.learning.collectors import world_seed
@@ -67,14 +67,14 @@ def build(name: str = "mappo", **options: Any) -> runs.Training:
 def parts(training: runs.Training) -> tuple[Any, Any]:
     """The loss and the collectors."""
     trainer: Any = training.trainer
-    return trainer.loss_module, training.flights
+    return trainer.loss_module, training.collector
 
 
 def batches(training: runs.Training, epoch: int = 0) -> list[TensorDictBase]:
     """An epoch's, without training on them."""
-    flight = parts(training)[1].launch(epoch)
-    found = [batch.clone() for batch in flight]
-    flight.shutdown()
+    several = parts(training)[1].make(epoch)
+    found = [batch.clone() for batch in several]
+    several.shutdown()
     return found
 
 
@@ -114,20 +114,20 @@ def unbroken(
 def test_every_layer_moves(
     kind: tuple[str, dict[str, Any]], unbroken: dict[str, bytes], tmp_path: Path
 ) -> None:
-    """From the weights that the training began with; what normalizes its inputs stays."""
+    """From the weights that the training started from; what normalizes its inputs stays."""
     name, options = kind
-    begun = TRAININGS[name](**options).module.state_dict()
+    first = TRAININGS[name](**options).module.state_dict()
     file = tmp_path / "weights.safetensors"
     file.write_bytes(unbroken[f"{name}.safetensors"])
     ended = load_file(file)
-    assert ended.keys() == begun.keys()
+    assert ended.keys() == first.keys()
     assert any("lstm" in key for key in ended) == options.get("recurrent", True)
     for key, value in ended.items():
         assert torch.isfinite(value).all()
         if ".normal." in key:
-            assert torch.equal(value, begun[key]), key
+            assert torch.equal(value, first[key]), key
         else:
-            assert (value != begun[key]).any(), key
+            assert (value != first[key]).any(), key
 
 
 def test_interrupted_after_an_epoch(
@@ -180,13 +180,13 @@ def test_card_and_scores(tmp_path: Path) -> None:
     assert (scores["runs"], scores["seeds"]) == (2, [0, 1])
     common = "motion=random:horizon=10:n_uavs=3"
     assert set(scores["rmse"]) == {f"{common}:nlos=0.3", f"{common}:false_matches=0.1"}
-    scene = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3, nlos=0.3)
+    scenario = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3, nlos=0.3)
     found = scores["rmse"][f"{common}:nlos=0.3"]
     assert set(found) == {"mappo", "ekf", "ekf:robust=huber"}
     for agent in found:
-        one = make(f"mappo:weights={weights}" if agent == "mappo" else agent, scene)
-        tape = play(one, scene, torch.arange(2), lambda steps: None)
-        expected = float(tape.error.square().mean().sqrt())
+        one = make(f"mappo:weights={weights}" if agent == "mappo" else agent, scenario)
+        recorded = record(one, scenario, torch.arange(2))
+        expected = float(np.sqrt(np.square(recorded.error).mean()))
         assert found[agent] == pytest.approx(expected, rel=1e-4)
 
 
@@ -208,13 +208,13 @@ def test_every_epoch_flies_worlds_of_its_own() -> None:
     training = build(variants="nlos=0.3/nlos=0.1/nlos=0.2/nlos=0.0", recurrent=False)
     seen: list[int] = []
     for epoch in range(2):
-        flight = parts(training)[1].launch(epoch)
-        for collector in flight.collectors:
+        several = parts(training)[1].make(epoch)
+        for collector in several.collectors:
             env = collector.env
             while hasattr(env, "base_env"):
                 env = env.base_env
             seen += env.env.world.seeds.tolist()
-        flight.shutdown()
+        several.shutdown()
     assert sorted(seen) == [world_seed(0, 0, 4) + i for i in range(8)]
 
 
@@ -225,8 +225,8 @@ def test_variants_share_the_batch_world_by_world() -> None:
     for half, variant in enumerate(("nlos=0.3", "landmark_std=1.0")):
         name, value = variant.split("=")
         overrides: dict[str, Any] = {name: float(value)}
-        scene = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3, **overrides)
-        env = mappo.environment(scene, 2, world_seed(0, 0, 4) + 2 * half, "none", 0.0)
+        scenario = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3, **overrides)
+        env = mappo.environment(scenario, 2, world_seed(0, 0, 4) + 2 * half, "none", 0.0)
         first = env.reset()
         rows = slice(6 * half, 6 * half + 6)
         assert torch.equal(together["state"][rows, 0], first["state"])
@@ -237,7 +237,7 @@ def test_the_learning_rate_falls_linearly() -> None:
     training = build(epochs=4, learning_rate=0.02)
     trainer: Any = training.trainer
     for epoch in range(4):
-        parts(training)[1].launch(epoch).shutdown()
+        parts(training)[1].make(epoch).shutdown()
         rates = {group["lr"] for group in trainer.optimizer.param_groups}
         assert list(rates) == pytest.approx([0.02 * (1 - epoch / 4)])
 
@@ -283,9 +283,9 @@ def test_before_training_a_batch_is_as_likely_as_it_was(name: str, recurrent: bo
         torch.testing.assert_close(found, batch["action_log_prob"], atol=1e-3, rtol=1e-3)
         with torch.no_grad():
             loss.value_estimator(batch)
-            told = loss(batch)
-        assert float(told["clip_fraction"]) == 0
-        assert abs(float(told["kl_approx"])) < 1e-4
+            found = loss(batch)
+        assert float(found["clip_fraction"]) == 0
+        assert abs(float(found["kl_approx"])) < 1e-4
     if recurrent:
         forgotten = second.select("observation", "is_init", "hidden", "cell")
         forgotten["hidden"].zero_()
@@ -294,8 +294,8 @@ def test_before_training_a_batch_is_as_likely_as_it_was(name: str, recurrent: bo
         assert (found - second["action_log_prob"]).abs().max() > 0.05, "or memory plays no part"
 
 
-class Told:
-    """A logger that keeps what it is told."""
+class Recording:
+    """A logger that keeps all values."""
 
     def __init__(self) -> None:
         self.values: dict[str, list[float]] = {}
@@ -311,12 +311,12 @@ def test_training_reads_what_was_flown(recurrent: bool) -> None:
     training = build(recurrent=recurrent, learning_rate=1e-12, minibatches=5)
     loud(training)
     trainer: Any = training.trainer
-    trainer.logger = told = Told()
+    trainer.logger = found = Recording()
     trainer.train()
-    assert len(told.values["max_ratio"]) == 4
-    assert told.values["max_ratio"] == pytest.approx([1.0] * 4, abs=1e-3)
-    assert told.values["mean_ratio"] == pytest.approx([1.0] * 4, abs=1e-3)
-    assert told.values["clip_fraction"] == [0.0] * 4
+    assert len(found.values["max_ratio"]) == 4
+    assert found.values["max_ratio"] == pytest.approx([1.0] * 4, abs=1e-3)
+    assert found.values["mean_ratio"] == pytest.approx([1.0] * 4, abs=1e-3)
+    assert found.values["clip_fraction"] == [0.0] * 4
 
 
 def constant(training: runs.Training, value: float) -> None:
@@ -358,8 +358,8 @@ def test_a_truncation_in_the_midst_of_a_batch_stops_the_sum() -> None:
     training = build(gamma=0.9, gae_lambda=1.0, recurrent=False, base="none")
     constant(training, 5.0)
     loss, _ = parts(training)
-    scene = make_scenario("indoor-v0", motion="random", horizon=4, n_uavs=3)
-    env = mappo.environment(scene, 2, 0, "none", 0.0)
+    scenario = make_scenario("indoor-v0", motion="random", horizon=4, n_uavs=3)
+    env = mappo.environment(scenario, 2, 0, "none", 0.0)
     torch.manual_seed(0)
     with torch.no_grad():
         batch = env.rollout(8, policy_of(actor_of(training)), break_when_any_done=False)
@@ -376,8 +376,8 @@ def gradients(training: runs.Training) -> Mapping[str, Tensor]:
     (batch, _) = batches(training)
     with torch.no_grad():
         loss.value_estimator(batch)
-    told = loss(batch)
-    sum(told[key] for key in told.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
+    found = loss(batch)
+    sum(found[key] for key in found.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
     return {key: p.grad for key, p in loss.named_parameters()}
 
 
@@ -419,15 +419,15 @@ def test_only_mappos_critic_sees_the_team() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "worlds=0 is not allowed: 1 to"),
-        ({"minibatches": 0}, "minibatches=0 is not allowed: 1 to"),
-        ({"hidden": 0}, "hidden=0 is not allowed: 1 to"),
-        ({"seed": -1}, "seed=-1 is not allowed: 0 to"),
-        ({"learning_rate": 0.0}, "learning_rate=0.0 is not allowed: more than 0"),
-        ({"clip": -0.2}, "clip=-0.2 is not allowed: more than 0"),
-        ({"gamma": 1.5}, "gamma=1.5 is not allowed: a number in [0, 1]"),
-        ({"entropy": -1.0}, "entropy=-1.0 is not allowed: a number in [0, 1]"),
-        ({"steps": 11}, "no horizon shorter than steps=11"),
+        ({"worlds": 0}, "worlds=0 is not allowed: a whole number"),
+        ({"minibatches": 0}, "minibatches=0 is not allowed: a whole number"),
+        ({"hidden": 0}, "hidden=0 is not allowed: a whole number"),
+        ({"seed": -1}, "seed=-1 is not allowed: a whole number"),
+        ({"learning_rate": 0.0}, "learning_rate=0.0 is not allowed: a number > 0"),
+        ({"clip": -0.2}, "clip=-0.2 is not allowed: a number > 0"),
+        ({"gamma": 1.5}, "gamma=1.5 is not allowed: a number from 0 to 1"),
+        ({"entropy": -1.0}, "entropy=-1.0 is not allowed: a number from 0 to 1"),
+        ({"steps": 11}, "steps=11 is not allowed: at most 10"),
         ({"worlds": 5, "variants": "nlos=0.1/nlos=0.2"}, "worlds=5 must be a multiple of the 2 va"),
         ({"variants": "nlos=0.1/nloss=0.2"}, "unknown option 'nloss' (did you mean 'nlos'?)"),
         (
@@ -438,7 +438,7 @@ def test_only_mappos_critic_sees_the_team() -> None:
         ({"variants": "horizon=10/horizon=30"}, "must have one horizon, one number of UAVs, and"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
         ({"base": "mappo:weights=none"}, "base='mappo:weights=none' is not allowed: a filter"),
-        ({"feedback": 2.0}, "feedback=2.0 is not allowed: a share in [0, 1]"),
+        ({"feedback": 2.0}, "feedback=2.0 is not allowed: a number from 0 to 1"),
         ({"recurrent": "yes"}, "recurrent='yes' is not allowed: true or false is needed"),
         ({"scenario": "indor-v0"}, "unknown scenario 'indor-v0' (did you mean 'indoor-v0'?)"),
         ({"scenario": f"{SCENARIO}:failure_rate=0.1"}, "UAVs that fail do not fit rows of one UAV"),

@@ -21,17 +21,17 @@ from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario, parse_scenario
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning import nnhpff as training
 from training.learning import run as runs
-from training.learning.collectors import fly, world_seed
+from training.learning.collectors import episode_collector, world_seed
 from training.learning.nnhpff import FAILED, MAINS, VARIANTS, DetectorLoss, Samples, samples_of
 from training.learning.registry import TRAININGS
 
 # Beliefs that a filter with few particles sometimes survives.
 SMALL: dict[str, Any] = {
     "scenario": "wsn-v0:horizon=40",
-    "variants": "case=1/q=0.0036:r_believed=0.0016",
+    "variants": "case=1/q=0.0036:believed_uwb_std=0.04",
     "mains": "pf:particles=60",
     "worlds": 1,
     "epochs": 2,
@@ -89,15 +89,17 @@ def test_gradient_is_that_of_finite_differences() -> None:
 
 
 def recorded(scenario: Scenario, main: str, worlds: int = 3, steps: int = 40) -> Any:
-    """A flight of a filter as trainings record it."""
+    """An episode of a filter as trainings record it."""
     localizer = make(main, scenario)
     policy = LocalizerPolicy(localizer, scenario, record=Samples(scenario))
-    (batch,) = fly(CoLocEnv(scenario, worlds, seed=5), policy, steps, compact_obs=True)
+    (batch,) = episode_collector(
+        CoLocEnv(scenario, worlds, seed=5), policy, steps, compact_obs=True
+    )
     return batch
 
 
 @pytest.fixture(scope="module")
-def flight() -> SimpleNamespace:
+def episode() -> SimpleNamespace:
     """Of two robots, one of which fails at step 30, and which lose ranges: four at once, too."""
     torch.set_num_threads(1)
     overrides: dict[str, Any] = {"case": 3, "n_uavs": 2, "horizon": 40, "dropout": 0.4}
@@ -106,9 +108,9 @@ def flight() -> SimpleNamespace:
 
 
 def test_features_are_those_of_the_estimate_and_the_label_is_the_truths(
-    flight: SimpleNamespace,
+    episode: SimpleNamespace,
 ) -> None:
-    batch, train = flight.batch, flight.batch["train"]
+    batch, train = episode.batch, episode.batch["train"]
     seen = {name: leaf.double().numpy() for name, leaf in batch["uav", "observation"].items()}
     position = batch["uav", "action"][..., :2].double().numpy()
     state = batch["state"].unflatten(-1, (2, -1)).double().numpy()
@@ -126,34 +128,36 @@ def test_features_are_those_of_the_estimate_and_the_label_is_the_truths(
     np.testing.assert_allclose(train["features"][..., 1:].numpy(), r, atol=1e-5)
 
 
-def test_only_what_is_measured_and_scored_becomes_a_sample(flight: SimpleNamespace) -> None:
-    train = flight.batch["train"]
-    measured = flight.batch["uav", "observation", "anchor_range_mask"].sum(-1) > 0
+def test_only_what_is_measured_and_scored_becomes_a_sample(episode: SimpleNamespace) -> None:
+    train = episode.batch["train"]
+    measured = episode.batch["uav", "observation", "anchor_range_mask"].sum(-1) > 0
     alive = torch.ones(3, 40, 2, dtype=torch.bool)
     alive[:, 30:, 1] = False
     assert torch.equal(train["scored"], measured & alive)
     assert not measured[alive].all()
-    found = samples_of(flight.batch)
+    found = samples_of(episode.batch)
     assert found.shape == (int((measured & alive).sum()),)
     for name in ("features", "failed", "error"):
         assert torch.equal(found[name], train[name][measured & alive])
 
 
-def test_samples_are_what_the_detector_sees_in_flight(flight: SimpleNamespace) -> None:
-    """The same worlds flown by a hybrid filter that never resets."""
-    one = make("nnhpff:weights=none:threshold=1:main=pf@particles=100", flight.scenario)
+def test_samples_are_what_the_detector_sees_online(episode: SimpleNamespace) -> None:
+    """The same worlds by a hybrid filter that never resets."""
+    one = make("nnhpff:weights=none:threshold=1:main=pf@particles=100", episode.scenario)
     seen: list[Tensor] = []
 
     def watch(before: Any, after: Any, tensordict: Any) -> dict[str, Tensor]:
         seen.append(after.distance)
         return {}
 
-    policy = LocalizerPolicy(one, flight.scenario, record=watch)
-    (batch,) = fly(CoLocEnv(flight.scenario, 3, seed=5), policy, 40, compact_obs=True)
-    assert torch.equal(batch["uav", "action"], flight.batch["uav", "action"])
-    count = flight.batch["uav", "observation", "anchor_range_mask"].sum(-1)
+    policy = LocalizerPolicy(one, episode.scenario, record=watch)
+    (batch,) = episode_collector(
+        CoLocEnv(episode.scenario, 3, seed=5), policy, 40, compact_obs=True
+    )
+    assert torch.equal(batch["uav", "action"], episode.batch["uav", "action"])
+    count = episode.batch["uav", "observation", "anchor_range_mask"].sum(-1)
     d = torch.stack(seen[-40:], 1) * 4 / count.clamp_min(1)
-    torch.testing.assert_close(flight.batch["train", "features"][..., 0], d.log1p())
+    torch.testing.assert_close(episode.batch["train", "features"][..., 0], d.log1p())
 
 
 # ---------------------------------------------------------------- worlds
@@ -163,18 +167,18 @@ def test_an_epoch_flies_every_filter_in_every_variant_in_worlds_of_its_own() -> 
     """Row by row: variants, in each the filters, of each the worlds."""
     mains = ["pf:particles=60", "ekf"]
     made = TRAININGS["nnhpff"](**SMALL | {"worlds": 2, "mains": "/".join(mains)})
-    scenes = [parse_scenario(f"wsn-v0:horizon=40:{one}") for one in SMALL["variants"].split("/")]
+    scenarios = [parse_scenario(f"wsn-v0:horizon=40:{one}") for one in SMALL["variants"].split("/")]
     for epoch in (0, 3):
-        flight = made.flights.launch(epoch)
-        (batch,) = list(flight)
-        flight.shutdown()
+        episode = made.collector.make(epoch)
+        (batch,) = list(episode)
+        episode.shutdown()
         assert batch.shape == (8, 40)
         seeds = world_seed(0, epoch, 8) + torch.arange(8).view(-1, 2)
-        crew = [(scene, main) for scene in scenes for main in mains]
-        for i, (scene, main) in enumerate(crew):
-            tape = play(make(main, scene), scene, seeds[i], lambda steps: None)
+        pairs = [(one, main) for one in scenarios for main in mains]
+        for i, (one, main) in enumerate(pairs):
+            recorded = record(make(main, one), one, seeds[i])
             found = batch["train", "error"][2 * i : 2 * i + 2]
-            torch.testing.assert_close(found, tape.error, rtol=0, atol=1e-5)
+            torch.testing.assert_close(found, torch.from_numpy(recorded.error), rtol=0, atol=1e-5)
     g = batch["train", "features"][..., 0, :].double()
     believed = g[..., 1:].square().sum(-1) / g[..., 0].expm1()
     expected = torch.tensor([0.04] * 4 + [0.0016] * 4).double().unsqueeze(-1)
@@ -244,9 +248,9 @@ def test_interrupted_in_training(
 
 def test_figures_of_an_epoch_are_said_of_worlds_not_yet_trained_on(unbroken: Path) -> None:
     made = TRAININGS["nnhpff"](**SMALL)
-    flight = made.flights.launch(0)
-    (batch,) = list(flight)
-    flight.shutdown()
+    episode = made.collector.make(0)
+    (batch,) = list(episode)
+    episode.shutdown()
     data = samples_of(batch)
     logits = made.module(data["features"]).detach()
     failed = data["failed"]
@@ -264,7 +268,7 @@ def test_figures_of_an_epoch_are_said_of_worlds_not_yet_trained_on(unbroken: Pat
 
 
 def test_it_learns(tmp_path: Path) -> None:
-    """To tell failures in worlds that it has not met, better than their share does."""
+    """To find failures in worlds that it has not met, better than their share does."""
     options = SMALL | {"epochs": 5, "passes": 10, "worlds": 4}
     runs.start("nnhpff", options, tmp_path / "run", quiet)
     held_out, constant = (
@@ -292,12 +296,12 @@ def test_card_and_weights(unbroken: Path) -> None:
 
 def test_scores_are_those_of_the_three_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "scenario_of", lambda text: parse_scenario(f"{text}:horizon=4"))
-    told: list[int] = []
+    reported: list[int] = []
     detector = untrained(FailureDetector, 0)
     with torch.no_grad():
         detector.out.bias += torch.tensor([-9.0, 9.0])  # always failed
-    found = training.score(detector, "wsn-v0", 2, lambda what, done, total: told.append(done))
-    assert told == [1, 2, 3]
+    found = training.score(detector, "wsn-v0", 2, lambda what, done, total: reported.append(done))
+    assert reported == [1, 2, 3]
     assert (found["runs"], found["seeds"]) == (2, [0, 1])
     for case in (1, 2, 3):
         names = {"pf_mean", "hpff_mean", "hpff_resets", "nnhpff_mean", "nnhpff_resets"}

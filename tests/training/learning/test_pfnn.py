@@ -12,12 +12,12 @@ from agents.particle.corrector import WeightCorrector
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning import pfnn_online
 from training.learning import run as runs
-from training.learning.collectors import fly, world_seed
+from training.learning.collectors import episode_collector, world_seed
 from training.learning.pfnn import CorrectorLoss, InTurn, Samples, samples_of
-from training.learning.pfnn_online import InFlight, PerWorld, learn_in_flight
+from training.learning.pfnn_online import OnlineLearning, PerWorld, learn_online
 
 SCENARIO = "indoor-v0:n_uavs=2:horizon=20"
 
@@ -85,15 +85,15 @@ def test_samples() -> None:
             return super().__call__(before, after, tensordict)
 
     policy = LocalizerPolicy(localizer, scenario, record=Watched(scenario))
-    (batch,) = fly(CoLocEnv(scenario, 3, seed=5), policy, 20, compact_obs=True)
-    flown = seen[-20:]
+    (batch,) = episode_collector(CoLocEnv(scenario, 3, seed=5), policy, 20, compact_obs=True)
+    steps = seen[-20:]
     train = batch["train"]
     assert train["features"].shape == (3, 20, 2, 50, 6)
     assert train["mask"].all()
     truth = batch["state"].unflatten(-1, (2, -1))[..., :3]
     error = (batch["uav", "action"][..., :3] - truth).norm(dim=-1)
     torch.testing.assert_close(train["error"], error)
-    for k, (before, after) in enumerate(flown):
+    for k, (before, after) in enumerate(steps):
         for b in range(3):
             for i in range(2):
                 live = after.particles[b, i, : after.count[b, i], :6]
@@ -136,15 +136,15 @@ def test_online_learns(tmp_path: Path) -> None:
 
 
 def test_the_filter_flies_with_the_newest_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learning in flight changes what is estimated, after the first training and not before."""
+    """Learning online changes what is estimated, after the first training and not before."""
     scenario = make_scenario("indoor-v0", n_uavs=2, horizon=30)
 
-    def flight() -> InFlight:
-        return learn_in_flight(scenario, 2, 0, quiet, correction=(0.05, 1.0))
+    def learn() -> OnlineLearning:
+        return learn_online(scenario, 2, 0, quiet, correction=(0.05, 1.0))
 
-    found, again = flight(), flight()
+    found, again = learn(), learn()
     monkeypatch.setattr(pfnn_online, "LEARNING_RATE", 0.0)
-    untrained = flight()
+    untrained = learn()
     assert found.error.shape == found.count.shape == (2, 30, 2)
     assert found.loss.shape == (2, 3)
     assert torch.equal(again.error, found.error)
@@ -153,28 +153,28 @@ def test_the_filter_flies_with_the_newest_weights(monkeypatch: pytest.MonkeyPatc
     assert not torch.allclose(untrained.error[:, 10:], found.error[:, 10:], atol=1e-4)
 
 
-def test_learning_in_flight_meets_the_worlds_of_evaluation() -> None:
+def test_learning_online_meets_the_worlds_of_evaluation() -> None:
     scenario = make_scenario("indoor-v0", n_uavs=2, horizon=10)
-    found = learn_in_flight(scenario, 2, 4, quiet, correction=(1.0, 1.0))
-    alone = play(make("apf", scenario), scenario, torch.tensor([4, 5]), lambda steps: None)
-    torch.testing.assert_close(found.error, alone.error, atol=1e-5, rtol=0)
+    found = learn_online(scenario, 2, 4, quiet, correction=(1.0, 1.0))
+    alone = record(make("apf", scenario), scenario, torch.tensor([4, 5]))
+    torch.testing.assert_close(found.error, torch.from_numpy(alone.error), atol=1e-5, rtol=0)
 
 
 def test_worlds_of_different_epochs_and_seeds_differ() -> None:
-    flown = [
+    steps = [
         world_seed(seed, epoch, 8) + row
         for seed in range(3)
         for epoch in range(4)
         for row in range(8)
     ]
-    assert len(set(flown)) == len(flown)
-    assert min(flown) > 10**9
+    assert len(set(steps)) == len(steps)
+    assert min(steps) > 10**9
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "worlds=0 is not allowed: 1 to"),
+        ({"worlds": 0}, "worlds=0 is not allowed: a whole number"),
         ({"learning_rate": 0.0}, "learning_rate=0.0"),
         ({"seed": -1}, "seed=-1"),
         ({"mode": "supervised"}, "one of offline, online"),

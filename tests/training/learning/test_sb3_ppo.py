@@ -16,7 +16,7 @@ from torch import Tensor
 from agents import make
 from agents.policies.learned import PolicyAgent
 from coloc_env.scenarios import make_scenario
-from training.evaluation.rollout import play
+from training.evaluation.record import record
 from training.learning import run as runs
 from training.learning import sb3_ppo
 from training.learning.collectors import world_seed
@@ -59,13 +59,13 @@ def build(**options: Any) -> tuple[runs.Training, Sb3Trainer]:
 
 
 class Silence:
-    """A logger that keeps what it is told."""
+    """A logger that keeps all values."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, float, int]] = []
+        self.values: list[tuple[str, float, int]] = []
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
-        self.told.append((name, value, step))
+        self.values.append((name, value, step))
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -105,14 +105,14 @@ def test_every_layer_moves(
     training, trainer = build(**options)
     trainer.model._setup_learn(1)  # what VecNormalize sees first
     sb3_ppo.exported(trainer.model, trainer.env, training.module)  # type: ignore[arg-type]
-    begun = training.module.state_dict()
+    first = training.module.state_dict()
     file = tmp_path / "weights.safetensors"
     file.write_bytes(unbroken["sb3-ppo.safetensors"])
     ended = load_file(file)
-    assert ended.keys() == begun.keys()
+    assert ended.keys() == first.keys()
     for key, value in ended.items():
         assert torch.isfinite(value).all()
-        assert (value != begun[key]).any(), key
+        assert (value != first[key]).any(), key
     bias = ended["head.layer.bias"]
     assert (bias[3:] != float(np.log(0.3))).all(), "the log-std is learned, too"
 
@@ -151,15 +151,17 @@ def test_every_epoch_flies_worlds_of_its_own_to_their_horizon() -> None:
 
     worlds.world.reset = noted
     frames = []
-    trainer.landed = lambda epochs: frames.append((epochs, trainer.collected_frames))
+    trainer.on_epoch_end = lambda epochs: frames.append((epochs, trainer.collected_frames))
     trainer.train()
     assert seen[::2] == [world_seed(0, epoch, 4) for epoch in range(3)]
     assert frames == [(1, 120), (2, 240), (3, 360)]
-    rates = [(step, value) for name, value, step in trainer.logger.told if name == "learning_rate"]
+    rates = [
+        (step, value) for name, value, step in trainer.logger.values if name == "learning_rate"
+    ]
     assert [step for step, _ in rates] == [60 * (k + 1) for k in range(6)]
     falling = [1e-3, 1e-3, 2e-3 / 3, 2e-3 / 3, 1e-3 / 3, 1e-3 / 3]
     assert [value for _, value in rates] == pytest.approx(falling)
-    logged = [(step, value) for name, value, step in trainer.logger.told if name == "rmse"]
+    logged = [(step, value) for name, value, step in trainer.logger.values if name == "rmse"]
     assert [step for step, _ in logged] == [60 * (k + 1) for k in range(6)]
     assert all(0 < value < 5 for _, value in logged)
 
@@ -185,27 +187,27 @@ def test_card_and_scores(tmp_path: Path) -> None:
     ((key, found),) = card["scores"]["rmse"].items()
     assert key == "motion=random:horizon=10:n_uavs=3"
     assert set(found) == {"sb3-ppo", "ekf", "ekf:robust=huber"}
-    scene = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3)
-    agent = make(f"sb3-ppo:weights={weights}", scene)
+    scenario = make_scenario("indoor-v0", motion="random", horizon=10, n_uavs=3)
+    agent = make(f"sb3-ppo:weights={weights}", scenario)
     assert isinstance(agent, PolicyAgent)
-    tape = play(agent, scene, torch.arange(2), lambda steps: None)
-    expected = float(tape.error.square().mean().sqrt())
+    recorded = record(agent, scenario, torch.arange(2))
+    expected = float(np.sqrt(np.square(recorded.error).mean()))
     assert found["sb3-ppo"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"worlds": 0}, "sb3-ppo: worlds=0 is not allowed: 1 to"),
-        ({"steps": 0}, "sb3-ppo: steps=0 is not allowed: 1 to"),
+        ({"worlds": 0}, "sb3-ppo: worlds=0 is not allowed: a whole number"),
+        ({"steps": 0}, "sb3-ppo: steps=0 is not allowed: a whole number"),
         ({"steps": 4}, "sb3-ppo: steps=4 must divide the horizon, 10"),
         ({"minibatches": 31}, "sb3-ppo: minibatches=31 is not allowed: at most 30"),
-        ({"learning_rate": 0.0}, "sb3-ppo: learning_rate=0.0 is not allowed: more than 0"),
-        ({"clip": 0.0}, "sb3-ppo: clip=0.0 is not allowed: more than 0"),
-        ({"gamma": 1.1}, "sb3-ppo: gamma=1.1 is not allowed: a number in [0, 1]"),
+        ({"learning_rate": 0.0}, "sb3-ppo: learning_rate=0.0 is not allowed: a number > 0"),
+        ({"clip": 0.0}, "sb3-ppo: clip=0.0 is not allowed: a number > 0"),
+        ({"gamma": 1.1}, "sb3-ppo: gamma=1.1 is not allowed: a number from 0 to 1"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
         ({"base": "sb3-ppo:weights=none"}, "base='sb3-ppo:weights=none' is not allowed: a filter"),
-        ({"feedback": -1.0}, "feedback=-1.0 is not allowed: a share in [0, 1]"),
+        ({"feedback": -1.0}, "feedback=-1.0 is not allowed: a number from 0 to 1"),
         ({"variants": "nlos=0.3"}, "sb3-ppo: unknown option 'variants'"),
         ({"recurrent": True}, "sb3-ppo: unknown option 'recurrent'"),
         ({"scenario": f"{SCENARIO}:failure_rate=0.1"}, "UAVs that fail do not fit rows of one UAV"),

@@ -27,12 +27,12 @@ from training.learning.augmentation import (
     VELOCITY_STD,
     SwarmAugmentation,
 )
-from training.learning.collectors import fly
+from training.learning.collectors import episode_collector
 from training.learning.registry import TRAININGS
 from training.learning.stdcl import StDclLoss, far_off
 
 SMALL: dict[str, Any] = {
-    "scenario": "swarm-v0:n_uavs=12:anchors=0.4:horizon=10:comm_radius=9000",
+    "scenario": "swarm-v0:n_uavs=12:anchor_share=0.4:horizon=10:comm_radius=9000",
     "variants": "/nlos=0.3:n_uavs=10",
     "worlds": 1,
     "epochs": 2,
@@ -51,20 +51,20 @@ def quiet(what: str, done: int, total: int) -> None:
 
 @pytest.fixture(scope="module")
 def recorded() -> SimpleNamespace:
-    """Four steps of two worlds as a training meets them, in the second batch of a flight."""
+    """Four steps of two worlds as a training meets them, in the second batch of an episode."""
     torch.set_num_threads(1)
-    scene = make_scenario("swarm-v0", n_uavs=12, anchors=0.4, horizon=8, nlos=0.4)
+    scenario = make_scenario("swarm-v0", n_uavs=12, anchor_share=0.4, horizon=8, nlos=0.4)
     network = untrained(StGnn, 0).double()
     generator = torch.Generator().manual_seed(0)
     for weight in network.parameters():
         weight.data += 0.03 * torch.randn(weight.shape, generator=generator, dtype=torch.float64)
-    loop: Any = make("stdcl:weights=none", scene)
+    loop: Any = make("stdcl:weights=none", scenario)
     loop.learn(network)
-    policy = LocalizerPolicy(loop, scene, record=partial(training._recorded, 0))
-    batches = list(fly(CoLocEnv(scene, 2, seed=5), policy, 4, compact_obs=True))
-    loss = StDclLoss(network, [loop], [scene], [5.0])
+    policy = LocalizerPolicy(loop, scenario, record=partial(training._recorded, 0))
+    batches = list(episode_collector(CoLocEnv(scenario, 2, seed=5), policy, 4, compact_obs=True))
+    loss = StDclLoss(network, [loop], [scenario], [5.0])
     return SimpleNamespace(
-        scene=scene, network=network, loop=loop, loss=loss, batch=batches[1].clone()
+        scenario=scenario, network=network, loop=loop, loss=loss, batch=batches[1].clone()
     )
 
 
@@ -72,18 +72,18 @@ def total(losses: Any) -> float:
     return float(sum(losses.values()))
 
 
-def test_the_flight_is_flown_again(recorded: SimpleNamespace) -> None:
+def test_the_loop_is_run_again(recorded: SimpleNamespace) -> None:
     """The loss is that of the estimates that were made."""
     found = recorded.loss(recorded.batch)["loss_position"]
     state = recorded.batch["state"].unflatten(-1, (12, -1)).double()
     action = recorded.batch["uav", "action"][..., :3].double()
-    free = slice(recorded.scene.guides, None)
+    free = slice(recorded.scenario.anchor_uavs, None)
     squared = (action - state[..., :3])[:, :, free].square().sum(-1)
     assert float(found.detach()) == pytest.approx(float(far_off(squared, 5.0).mean()), rel=1e-3)
 
 
 def test_gradient_of_one_step_is_that_of_finite_differences(recorded: SimpleNamespace) -> None:
-    """Nothing is fed back to a flight's first step, so that its gradient is exact."""
+    """Nothing is fed back to an episode's first step, so that its gradient is exact."""
     batch, loss = recorded.batch[:, :1], recorded.loss
     loss.zero_grad()
     sum(loss(batch).values()).backward()
@@ -109,7 +109,7 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
     """Position and confidence of a step move the position found in the next one, nearly as the
     first order says that the training follows."""
     loop, batch = recorded.loop, recorded.batch
-    leaves = training.all_leaves(recorded.scene)
+    leaves = training.all_leaves(recorded.scenario)
 
     def next_place(shift: float, doubt: float, gradients: bool) -> tuple[Any, Any]:
         seen = batch["uav", "observation"][:, 1]
@@ -136,7 +136,7 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
             owed = loops._owed(belief, now, scene, off)
         return found.position.detach() + owed, state
 
-    free = slice(recorded.scene.guides, None)
+    free = slice(recorded.scenario.anchor_uavs, None)
     plain, _ = next_place(0.0, 0.0, False)
     there, state = next_place(0.0, 0.0, True)
     assert torch.equal(there.detach(), plain)
@@ -174,20 +174,20 @@ def test_smoothness_is_of_the_second_stage_and_forgives_manoeuvres(
 
 
 def test_augmentations_are_what_they_say_and_alike_at_both_ends() -> None:
-    scene = make_scenario("swarm-v0", n_uavs=30, horizon=40, comm_radius=None)
-    plain = CoLocEnv(scene, 2, seed=3)
-    changed = TransformedEnv(CoLocEnv(scene, 2, seed=3), SwarmAugmentation(10.0, 7))
-    again = TransformedEnv(CoLocEnv(scene, 2, seed=3), SwarmAugmentation(10.0, 7))
+    scenario = make_scenario("swarm-v0", n_uavs=30, horizon=40, comm_radius=None)
+    plain = CoLocEnv(scenario, 2, seed=3)
+    changed = TransformedEnv(CoLocEnv(scenario, 2, seed=3), SwarmAugmentation(10.0, 7))
+    again = TransformedEnv(CoLocEnv(scenario, 2, seed=3), SwarmAugmentation(10.0, 7))
     action = plain.action_spec.zero()
 
-    def flown(env: Any) -> TensorDict:
+    def rollout(env: Any) -> TensorDict:
         seen, found = env.reset(), []
         for _ in range(30):
             found.append(seen["uav", "observation"].clone())
             seen = env.step(seen.update(action))["next"]
         return torch.stack(found)
 
-    one, other, same = flown(plain), flown(changed), flown(again)
+    one, other, same = rollout(plain), rollout(changed), rollout(again)
     assert all(torch.equal(other[k], same[k]) for k in ("ranges", "range_mask", "ins"))
     kept = other["range_mask"][one["range_mask"] > 0].mean()
     assert float(kept) == pytest.approx(1 - EDGE_DROPOUT, abs=0.01)
@@ -247,7 +247,7 @@ def test_the_two_stages_and_the_cosine() -> None:
     made = TRAININGS["stdcl"](**{**SMALL, "epochs": 11, "smooth_from": 0.5})
     loss: Any = made.trainer.loss_module
     for epoch, share, smooth in ((0, 1.0, False), (5, 0.5, False), (6, 0.345, True), (10, 0, True)):
-        made.flights.launch(epoch).shutdown()
+        made.collector.make(epoch).shutdown()
         (rate,) = {group["lr"] for group in made.trainer.optimizer.param_groups}
         assert rate == pytest.approx(1e-5 + (5e-4 - 1e-5) * share, rel=0.01)
         assert (loss.smooth > 0) == smooth

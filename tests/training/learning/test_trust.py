@@ -21,7 +21,7 @@ from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenarios import make_scenario
 from training.learning import run as runs
 from training.learning import trust as training
-from training.learning.collectors import fly
+from training.learning.collectors import episode_collector
 from training.learning.registry import TRAININGS
 from training.learning.trust import TrustLoss, negative_log_likelihood
 
@@ -78,29 +78,29 @@ class Exact(TrustNetwork):
 
 @pytest.fixture(scope="module")
 def recorded() -> SimpleNamespace:
-    """Three steps of two worlds as a training meets them, with weights that tell outliers apart."""
+    """Three steps of two worlds as a training meets them, with weights that discern outliers."""
     torch.set_num_threads(1)
-    scene = make_scenario("indoor-v0", n_uavs=3, horizon=9, nlos=0.5, false_matches=0.3)
+    scenario = make_scenario("indoor-v0", n_uavs=3, horizon=9, nlos=0.5, false_matches=0.3)
     network = Exact()
     load("trust", network)
     network.double()
-    ekf: Any = make("ekf_trust", scene, weights="none")
+    ekf: Any = make("ekf_trust", scenario, weights="none")
     ekf.learn(network)
-    policy = LocalizerPolicy(ekf, scene, record=partial(training._record, 0))
-    batches = list(fly(CoLocEnv(scene, 2, seed=5), policy, 3, compact_obs=True))
-    return SimpleNamespace(scene=scene, network=network, ekf=ekf, batch=batches[1].clone())
+    policy = LocalizerPolicy(ekf, scenario, record=partial(training._record, 0))
+    batches = list(episode_collector(CoLocEnv(scenario, 2, seed=5), policy, 3, compact_obs=True))
+    return SimpleNamespace(scenario=scenario, network=network, ekf=ekf, batch=batches[1].clone())
 
 
-def test_the_flight_is_flown_again(recorded: SimpleNamespace) -> None:
+def test_the_filter_is_run_again(recorded: SimpleNamespace) -> None:
     """The loss is that of the estimates that were made."""
-    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scene])
+    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scenario])
     found = float(loss(recorded.batch)["loss_trust"].detach())
     truth = recorded.batch["state"].unflatten(-1, (3, -1)).double()
     losses, belief = [], training._belief(recorded.batch["train"][:, 0])
     for t in range(3):
-        told = recorded.batch["train"][:, t]
+        entries = recorded.batch["train"][:, t]
         for name in ("state", "covariance", "memory", "step"):
-            torch.testing.assert_close(belief.get(name), told[name], rtol=0, atol=1e-6)
+            torch.testing.assert_close(belief.get(name), entries[name], rtol=0, atol=1e-6)
         seen = recorded.batch["uav", "observation"][:, t]
         observation = training.Observation(dict(seen.items()))
         belief, estimate = recorded.ekf.step(belief, observation)
@@ -116,7 +116,7 @@ def test_gradient_is_that_of_finite_differences(
 ) -> None:
     """Through all three steps. What the networks see counts as given: it is detached, so that it
     has to be held where it was while the weights are moved."""
-    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scene])
+    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scenario])
     kept: list[Tensor] = []
     plain = trust_screen.features
 
@@ -152,7 +152,7 @@ def test_gradient_is_that_of_finite_differences(
 
 def test_failed_uavs_do_not_count(recorded: SimpleNamespace) -> None:
     """A state's last number says whether it is scored; what is not may be anywhere."""
-    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scene])
+    loss = TrustLoss(recorded.network, [recorded.ekf], [recorded.scenario])
 
     def of(scored: float, away: float) -> float:
         batch = recorded.batch.clone()
@@ -167,10 +167,10 @@ def test_failed_uavs_do_not_count(recorded: SimpleNamespace) -> None:
     assert of(0.0, 0.0) != of(1.0, 0.0)
 
 
-# ---------------------------------------------------------------- flights
+# ---------------------------------------------------------------- epochs
 
 
-def test_an_epoch_flies_every_variant_in_worlds_of_its_own(
+def test_an_epoch_has_every_variant_in_worlds_of_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(training, "VARIANTS", VARIANTS)
@@ -178,10 +178,10 @@ def test_an_epoch_flies_every_variant_in_worlds_of_its_own(
     optimizer = made.trainer.optimizer
     priors = set()
     for epoch, share in ((0, 1.0), (1, 0.05)):
-        flight = made.flights.launch(epoch)
+        collector = made.collector.make(epoch)
         assert [group["lr"] for group in optimizer.param_groups] == [pytest.approx(2e-3 * share)]
-        batches = list(flight)
-        flight.shutdown()
+        batches = list(collector)
+        collector.shutdown()
         assert [int(b["train", "variant"][0, 0]) for b in batches] == [0, 1, 0, 1]
         assert all(b.shape == (1, 5) for b in batches)
         priors |= {float(b["uav", "observation", "prior"][0, 0, 0, 0]) for b in batches}

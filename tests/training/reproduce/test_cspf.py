@@ -30,7 +30,9 @@ def made_up(share: float, worst: float, steps: int = plan.LATE) -> Runs:
         nees=np.full_like(error, 2.0),
         ms_per_step=1.0,
     )
-    results = SimpleNamespace(agents={"x": one}, scored=np.ones_like(error, bool), runs=RUNS)
+    results = SimpleNamespace(
+        agents={"x": one}, worlds=SimpleNamespace(scored=np.ones_like(error, bool)), runs=RUNS
+    )
     return Runs(results, "x")  # type: ignore[arg-type]
 
 

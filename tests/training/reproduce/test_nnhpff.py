@@ -10,7 +10,8 @@ from sklearn import metrics
 
 from agents import make
 from coloc_env.scenarios import make_scenario
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.record import RunRecord
+from training.evaluation.results import Evaluation
 from training.reproduce.nnhpff import detection, plan
 from training.reproduce.nnhpff.claims import verdicts
 from training.reproduce.nnhpff.measures import HELD, Runs
@@ -91,20 +92,18 @@ def flown(error: np.ndarray, resets: np.ndarray | None = None) -> Runs:
     """An agent's runs with these errors [R, K] (m) and resets."""
     error = error[..., None].astype(np.float32)
     series = {} if resets is None else {"resets_per_run": resets[..., None].astype(np.float32)}
-    one = AgentResult(
+    one = RunRecord(
         offset=np.stack((error, 0 * error), -1),
         error=error,
         nees=np.full(error.shape, 2.0, np.float32),
         broken=np.zeros(len(error), bool),
-        raised=0,
-        message=None,
         series=series,
         ms_per_step=None,
     )
     scored = np.ones(error.shape, bool)
     scenario = make_scenario("wsn-v0", horizon=error.shape[1])
     truth = np.zeros((*error.shape, 2))
-    return Runs(Results(scenario, 0, truth, truth[0, :, :, :1], scored, None, {"x": one}), "x")
+    return Runs(Evaluation(scenario, 0, truth, truth[0, :, :, :1], scored, None, {"x": one}), "x")
 
 
 def test_figures_of_a_run() -> None:
@@ -205,7 +204,7 @@ def quiet(*_: Any) -> None:
 
 
 def test_a_small_report(tmp_path: Path) -> None:
-    where = ["case1", "case1-kidnap_at=18", "trained-q=1-r_believed=0.36"]
+    where = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
     small: dict[str, Any] = {"runs": 2, "seed": 0, "where": where, "steps": 25, "jobs": 1}
     reproduce(tmp_path, "all", missing=True, tell=quiet, note=quiet, **small)
     text = (tmp_path / "report.md").read_text()

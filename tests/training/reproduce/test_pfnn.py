@@ -13,7 +13,8 @@ from typer.testing import CliRunner, Result
 from coloc_env.bounds import Bound
 from coloc_env.scenarios import make_scenario
 from training.cli.command import app
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.record import RunRecord, Worlds
+from training.evaluation.results import Evaluation
 from training.reproduce.cost import Cost
 from training.reproduce.pfnn import goals, paper, report, robustness, tables
 from training.reproduce.pfnn.claims import verdicts
@@ -33,37 +34,30 @@ PAPERS = {  # errors as the paper has them, in m: what would bear out its claims
 SERIES = {"particles": 790.0, "ess_share": 0.45}
 
 
-def made(size: Mapping[str, float], series: Mapping[str, float] = SERIES) -> Results:
+def made(size: Mapping[str, float], series: Mapping[str, float] = SERIES) -> Evaluation:
     """Agents whose errors have these sizes (m), alike but for 2 % from run to run; particle filters
     with these figures of their own."""
     rng = np.random.default_rng(0)
     scenario = make_scenario("indoor-v0", horizon=STEPS)
     shape = (RUNS, STEPS, 6)
     world = rng.uniform(0.8, 1.2, size=(RUNS, 1, 1)) * rng.uniform(0.5, 1.3, size=shape)
+    scored = torch.ones(shape, dtype=torch.bool)
+    worlds = Worlds(0, np.full((*shape, 3), 5.0), np.zeros((STEPS, 6, 4)), scored.numpy())
     agents = {}
     for name, scale in size.items():
         error = scale * world * (1 + 0.02 * rng.normal(size=(RUNS, 1, 1)))
         own = {} if name.startswith("ekf") else series
-        agents[name] = AgentResult(
+        agents[name] = RunRecord(
+            worlds=worlds,
             offset=np.stack((error, 0 * error, 0 * error), -1).astype(np.float32),
             error=error.astype(np.float32),
             nees=np.full(shape, 3.0, np.float32),
             broken=np.zeros(RUNS, bool),
-            raised=0,
-            message=None,
             series={key: np.full(shape, value, np.float32) for key, value in own.items()},
             ms_per_step=None,
         )
-    scored = torch.ones(shape, dtype=torch.bool)
-    return Results(
-        scenario=scenario,
-        seed=0,
-        truth=np.full((*shape, 3), 5.0),
-        attitude=np.zeros((STEPS, 6, 4)),
-        scored=scored.numpy(),
-        bound=Bound(torch.full(shape, 0.034**2, dtype=torch.float64), scored, 0.1),
-        agents=agents,
-    )
+    bound = Bound(torch.full(shape, 0.034**2, dtype=torch.float64), scored, 0.1)
+    return Evaluation(scenario, worlds, bound, agents)
 
 
 def flown(size: Mapping[str, float] = PAPERS, series: Mapping[str, float] = SERIES) -> Flown:
@@ -222,7 +216,7 @@ def hard(size: Mapping[str, float]) -> dict[str, robustness.Cell]:
 
 
 SIZES = {"apf": 0.08, "ekf:robust=huber": 0.05, "ekf:robust=gate": 0.04}
-TRUST = {"pfnn_trust": 0.035, "pfnn_trust:weights=b": 0.06}
+TRUST = {"pf_trust": 0.035, "pf_trust:weights=b": 0.06}
 
 
 def outcome(found: robustness.Cells, agent: str, *words: str) -> goals.Outcome:
@@ -249,8 +243,8 @@ def test_goals_are_judged_for_every_training_of_an_agent() -> None:
 
 
 def test_a_goal_without_its_rival_is_not_measured() -> None:
-    found = {"few-nlos": hard({"pfnn_trust": 0.03})}
-    one = outcome(found, "pfnn_trust", "RMSE ≤ 0.85 ×")
+    found = {"few-nlos": hard({"pf_trust": 0.03})}
+    one = outcome(found, "pf_trust", "RMSE ≤ 0.85 ×")
     assert (one.verdict, one.found) == (goals.UNKNOWN, "not flown: `ekf:robust=huber`")
 
 
@@ -275,8 +269,8 @@ def test_robust_tables_and_figures(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {*names, "robustness_paired.png"}
     content = json.loads((tmp_path / "robustness.json").read_text())
     assert len(content["rows"]) == 9
-    row = next(r for r in content["rows"] if r["agent"] == "pfnn_trust" and r["bound"] is None)
-    cell = found["few-nlos"]["pfnn_trust"]
+    row = next(r for r in content["rows"] if r["agent"] == "pf_trust" and r["bound"] is None)
+    cell = found["few-nlos"]["pf_trust"]
     other = found["few-nlos"]["ekf:robust=huber"]
     assert row["rmse"] == pytest.approx(cell.figures["rmse"])
     assert row["minus ekf:robust=huber"] == pytest.approx((cell.rmse - other.rmse).mean())

@@ -14,7 +14,8 @@ from agents.registry import LOCALIZERS
 from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
 from coloc_env.scenarios import make_scenario
 from training.cli.command import app
-from training.evaluation.results import AgentResult, Results
+from training.evaluation.record import RunRecord, Worlds
+from training.evaluation.results import Evaluation
 from training.reproduce import pool
 from training.reproduce.cost import Cost
 from training.reproduce.stdcl import goals, links, plan, tables
@@ -93,21 +94,14 @@ def flown(error: Any, agent: str = "x", steps: int = STEPS, noise: float = 0.02)
     error = np.repeat(np.asarray(error)[..., None], N, -1).astype(np.float32)
     offset = np.zeros((*error.shape, 3), np.float32)
     offset[..., 0] = error * np.where(np.arange(N) % 2, 1, -1)
-    one = AgentResult(
-        offset=offset,
-        error=error,
-        nees=np.full(error.shape, 3.0, np.float32),
-        broken=np.zeros(len(error), bool),
-        raised=0,
-        message=None,
-        series={},
-        ms_per_step=None,
-    )
     scored = np.ones(error.shape, bool)
     scored[..., 0] = False  # an anchor
     scenario = make_scenario("swarm-v0", n_uavs=N, horizon=error.shape[1])
     truth = np.zeros((*error.shape, 3)) + 1000.0 * np.arange(N)[:, None] * np.array([1.0, 0, 0])
-    return Runs(Results(scenario, 0, truth, truth[0], scored, None, {agent: one}), agent)
+    worlds = Worlds(0, truth, truth[0], scored)
+    nees, broken = np.full(error.shape, 3.0, np.float32), np.zeros(len(error), bool)
+    one = RunRecord(worlds, offset, error, nees, broken)
+    return Runs(Evaluation(scenario, worlds, None, {agent: one}), agent)
 
 
 def test_figures_of_a_run() -> None:

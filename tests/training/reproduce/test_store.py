@@ -138,7 +138,7 @@ def test_weights(nested: bool) -> None:
     assert identity.weights_of(learned(2.0, nested)) != one
 
 
-@pytest.mark.parametrize("agent", ["pfnn", "pfnn_trust", "ekf_trust"])
+@pytest.mark.parametrize("agent", ["pfnn", "pf_trust", "ekf_trust"])
 def test_weights_of_learned_agents(agent: str) -> None:
     scenario = make_scenario("indoor-v0")
     one = make(agent, scenario, weights="none")

@@ -38,9 +38,9 @@ def test_blocks_add_up_to_the_evaluation(store: Store) -> None:
     results = fly(store, agents, 3, 2).results(SMALL, agents, 3, 2)
     whole = evaluate(make_scenario("indoor-v0", n_uavs=2, horizon=12), agents, runs=5, seed=5)
     assert (results.runs, results.seed, list(results.agents)) == (5, 5, list(agents))
-    np.testing.assert_array_equal(results.truth, whole.truth)
-    np.testing.assert_array_equal(results.attitude, whole.attitude)
-    np.testing.assert_array_equal(results.scored, whole.scored)
+    np.testing.assert_array_equal(results.worlds.truth, whole.worlds.truth)
+    np.testing.assert_array_equal(results.worlds.attitude, whole.attitude)
+    np.testing.assert_array_equal(results.worlds.scored, whole.worlds.scored)
     assert results.bound is not None
     assert whole.bound is not None
     assert results.bound.rmse == pytest.approx(whole.bound.rmse)
@@ -123,9 +123,9 @@ def test_an_agent_that_raises_is_counted_not_dropped(store: Store) -> None:
     results = fly(store, agents, 4, 2).results(SMALL, agents, 4, 2)
     fell = results.agents[agents[0]]
     assert fell.error.shape == (6, 12, 2)
-    assert 0 < fell.raised == fell.broken.sum() < 6
-    assert "singular" in (fell.message or "")
-    assert results.summary["agents"][agents[0]]["diverged_runs"] >= fell.raised
+    assert 0 < len(fell.messages) == fell.broken.sum() < 6
+    assert "singular" in fell.messages[0]
+    assert results.summary["agents"][agents[0]]["diverged_runs"] >= len(fell.messages)
 
 
 def test_what_cannot_be_flown_is_told_and_the_rest_goes_on(store: Store) -> None:

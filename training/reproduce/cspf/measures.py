@@ -32,5 +32,5 @@ class Runs(AgentRuns):
     def nees(self) -> float:
         """Mean over the second half of the runs' steps."""
         half = self.steps // 2
-        values = self.one.nees[:, half:][self.results.scored[:, half:]]
+        values = self.one.nees[:, half:][self.results.worlds.scored[:, half:]]
         return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

@@ -111,7 +111,7 @@ def _claims(steps: int | None) -> Iterator[tuple[Claim, str, tuple[str, str]]]:
 def late(runs: Runs) -> Floats:
     """[R]: RMSE over the last third of each run, m."""
     start = int((1 - LATE) * runs.steps)
-    return rmse_per_run(runs.one.error[:, start:], runs.results.scored[:, start:])
+    return rmse_per_run(runs.one.error[:, start:], runs.results.worlds.scored[:, start:])
 
 
 def table(found: Mapping[str, Mapping[str, Runs]]) -> Table:
@@ -121,7 +121,7 @@ def table(found: Mapping[str, Mapping[str, Runs]]) -> Table:
     lines = []
     for title, there in found.items():
         for agent, one in there.items():
-            whole, end = rmse_per_run(one.one.error, one.results.scored), late(one)
+            whole, end = rmse_per_run(one.one.error, one.results.worlds.scored), late(one)
             known, cost = "converged" in one.one.series, one.one.ms_per_step
             lines.append(
                 [

@@ -19,7 +19,7 @@ _LINES = {  # of the filters
     "ekf": (MUTED, ":"),
     "ekf:robust=huber": (MUTED, "--"),
     "ekf_trust": ("#009E73", "-."),
-    "pfnn_trust": ("#D55E00", "-."),
+    "pf_trust": ("#D55E00", "-."),
 }
 _OWN = "#0072B2"
 _TRIED = {"mixed": "default", "huber-nlos": "nlos", "huber-uwb": "uwb", "displacement": "default"}

@@ -7,7 +7,7 @@ from training.reproduce.study import Variant
 
 SEEDS = 5
 SCENARIO = "indoor-v0:motion=random:horizon=200"
-FILTERS = ("ekf", "ekf:robust=huber", "ekf_trust", "pfnn_trust")
+FILTERS = ("ekf", "ekf:robust=huber", "ekf_trust", "pf_trust")
 _UWB = (
     *(("uwb_std", 0.3), ("nlos", 1.0), ("nlos_bias", 0.5), ("nlos_kind", "constant")),
     ("believed_uwb_std", 0.05),

@@ -12,7 +12,7 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import Results, short, table
+from training.evaluation.results import Evaluation, short, table
 from training.reproduce.marl import figures
 from training.reproduce.marl.plan import FILTERS, Goal, Trained, goals, variants
 from training.reproduce.study import WORLD, Study
@@ -127,10 +127,10 @@ def learning_curve(one: Trained, folder: Path) -> list[tuple[Floats, Floats]]:
     return curves
 
 
-def _figures(results: Results, names: Sequence[str]) -> Figures:
+def _figures(results: Evaluation, names: Sequence[str]) -> Figures:
     per_run, steady = [], []
     for name in names:
-        error, scored = results.agents[name].error, results.scored
+        error, scored = results.agents[name].error, results.worlds.scored
         per_run.append((error * scored).sum((1, 2)) / scored.sum((1, 2)))
         steady.append(metrics.rmse_after(error, scored, results.dt, SETTLED))
     means = [float(each.mean()) for each in per_run]

@@ -36,7 +36,7 @@ def case(title: str, there: Mapping[str, Runs]) -> Figure:
     figure, grid = panels(2, 2, (9.5, 6.6), title)
     (path, error), (first, second) = grid
     results = next(iter(there.values())).results
-    truth, time = results.truth[0, :, 0], _time(results.truth.shape[1], results.dt)
+    truth, time = results.worlds.truth[0, :, 0], _time(results.worlds.truth.shape[1], results.dt)
     path.plot(truth[:, 0], truth[:, 1], color="black", linewidth=1.0, label="truth")
     for i, (agent, one) in enumerate(there.items()):
         look = _look(agent, i)

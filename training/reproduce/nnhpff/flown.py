@@ -48,7 +48,7 @@ class Flown:
         parts: list[tuple[Floats, Floats, Floats]] = []
         for variant, agent in scenes:
             for one in self.runs(variant, [agent], count).values():
-                series, scored = one.one.series, one.results.scored
+                series, scored = one.one.series, one.results.worlds.scored
                 told = series["failure"], series["mahalanobis"], one.error
                 parts.append(tuple(x[scored] for x in told))  # type: ignore[arg-type]
         if not parts:

@@ -27,11 +27,13 @@ class Runs(AgentRuns):
 
     def ale(self) -> Floats:
         """[R]: mean error over a run, m (the paper's averaged localization error)."""
-        return metrics.mean_per_run(self.error, self.results.scored)
+        return metrics.mean_per_run(self.error, self.results.worlds.scored)
 
     def settled_ale(self) -> Floats:
         """[R]: the same after the first 2 s."""
-        return metrics.mean_per_run(self.error[:, SETTLED:], self.results.scored[:, SETTLED:])
+        return metrics.mean_per_run(
+            self.error[:, SETTLED:], self.results.worlds.scored[:, SETTLED:]
+        )
 
     def resets_per_run(self) -> Floats:
         """[R], mean over UAVs."""

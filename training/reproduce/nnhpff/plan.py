@@ -43,10 +43,10 @@ def never_seen(steps: int | None) -> list[tuple[Variant, str]]:
     """Scenarios that differ from all of those: in what is believed, in the true noise, in what goes
     wrong."""
     texts = (
-        "q=0.015:r_believed=0.1",
-        "q=0.3:r_believed=0.008",
-        "case=3:r_true=0.01",
-        "case=3:r_true=0.16",
+        "q=0.015:believed_uwb_std=0.3162",
+        "q=0.3:believed_uwb_std=0.08944",
+        "case=3:uwb_std=0.1",
+        "case=3:uwb_std=0.4",
         f"case=1:kidnap_at={KIDNAPPED_AT:g}",
         "case=3:nlos_anchor=1",
         "case=1:nlos=0.2",
@@ -66,7 +66,7 @@ def sensitivity(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
         found.append((case(number, steps), (*own, *longer)))
         for std in (0.1, 0.4):
             share = {1: 1.0, 2: 1 / 25, 3: 9.0}[number]
-            believed = {"r_true": std**2, "r_believed": share * std**2}
+            believed = {"uwb_std": std, "believed_uwb_std": share**0.5 * std}
             found.append((case(number, steps, **believed), METHODS))
     for q in (0.001, 0.01, 0.03):
         found.append((case(3, steps, q=q), METHODS))

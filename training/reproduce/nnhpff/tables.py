@@ -23,7 +23,7 @@ def errors(found: Mapping[str, Mapping[str, Runs]]) -> Table:
         bound = next((one.results.bound for one in there.values()), None)
         words = title if bound is None else f"{title} (its model's bound: {bound.rmse:.3f} RMSE)"
         for agent, one in there.items():
-            nees = one.one.nees[one.results.scored]
+            nees = one.one.nees[one.results.worlds.scored]
             lines.append(
                 [
                     words,
@@ -128,7 +128,7 @@ def plain_errors(found: Mapping[str, Mapping[str, Runs]], lost: str) -> Table:
     lines = []
     for title, there in found.items():
         for agent, one in there.items():
-            error = one.error[one.results.scored]
+            error = one.error[one.results.worlds.scored]
             lines.append(
                 [
                     title,

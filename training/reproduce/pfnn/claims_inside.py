@@ -82,7 +82,9 @@ def _share(f: Flown, key: str, low: float, high: float) -> Difference:
     """Per cent of the steps after 10 s with a figure from ``low`` to ``high``."""
     values, late = f.tables.agents["pfnn"].series[key][:, f.steady], f.steady
     inside = 100.0 * ((values >= low) & (values <= high))
-    return interval(metrics.mean_per_run(inside, f.tables.scored[:, late] & ~np.isnan(values)))
+    return interval(
+        metrics.mean_per_run(inside, f.tables.worlds.scored[:, late] & ~np.isnan(values))
+    )
 
 
 def _share_resampling(f: Flown) -> Difference:
@@ -220,7 +222,7 @@ def _learning() -> Iterator[Case]:
         if f.learning is None:
             return None
         error = f.learning.error
-        ours = metrics.rmse_per_run(error, f.tables.scored[:, : error.shape[1]])
+        ours = metrics.rmse_per_run(error, f.tables.worlds.scored[:, : error.shape[1]])
         return gain(ours, f.rmse("apf"))
 
     size = paper.GAINS["apf"]

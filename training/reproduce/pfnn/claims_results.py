@@ -79,7 +79,8 @@ def _figure_9() -> Iterator[Case]:
     def best(f: Flown) -> Difference:
         """Per cent of runs in which PF-NN is the best."""
         per_run = {
-            a: metrics.rmse_per_run(f.cdf.agents[a].error, f.cdf.scored) for a in f.cdf.agents
+            a: metrics.rmse_per_run(f.cdf.agents[a].error, f.cdf.worlds.scored)
+            for a in f.cdf.agents
         }
         best = np.min([per_run[rival] for rival in rivals], axis=0)
         return interval(100.0 * (per_run["pfnn"] < best))

@@ -108,9 +108,9 @@ def trajectories(flown: Flown) -> Figure:
     figure = Figure(figsize=(9.5, 5.6))
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot(projection="3d")
-    estimate = results.truth[0] + results.agents[SHOWN].offset[0]
+    estimate = results.worlds.truth[0] + results.agents[SHOWN].offset[0]
     for i, colour in enumerate(_uavs(flown)):
-        axes.plot(*results.truth[0, :, i].T, color=colour, linewidth=1.0, label=_name(i))
+        axes.plot(*results.worlds.truth[0, :, i].T, color=colour, linewidth=1.0, label=_name(i))
         axes.plot(*estimate[:, i].T, "--", color=INK, linewidth=0.8)
     leaves = World(results.scenario, window=1).reset(results.seed).leaves
     if "landmark_map" in leaves:
@@ -135,7 +135,7 @@ def errors(flown: Flown) -> Figure:
     bound."""
     results = flown.tables
     error = results.agents[SHOWN].error
-    squares = np.sqrt(np.nanmean(np.where(results.scored, error, np.nan) ** 2, 0))
+    squares = np.sqrt(np.nanmean(np.where(results.worlds.scored, error, np.nan) ** 2, 0))
     figure, panels = _over_time(flown, "Position error over time", "error (m)", error[0], squares)
     for i, axes in enumerate(panels):
         if results.bound is not None:
@@ -148,7 +148,7 @@ def bars(flown: Flown) -> Figure:
     """Figure 5: RMSE of each UAV, the paper's above ours (mean over runs; whiskers: standard
     deviation)."""
     figure, (axes,) = _panels(1, 3.8, f"RMSE of each UAV · PF-NN, {flown.tables.runs} runs")
-    tracks = metrics.rmse_per_track(flown.error(SHOWN), flown.tables.scored)
+    tracks = metrics.rmse_per_track(flown.error(SHOWN), flown.tables.worlds.scored)
     ours, apart = tracks.mean(0), tracks.std(0)
     theirs = [row.rmse for name, row in paper.TABLE_3.items() if name != "Average"]
     at = np.arange(len(ours))
@@ -173,7 +173,7 @@ def boxes(flown: Flown) -> Figure:
     results = flown.tables
     error = results.agents[SHOWN].error
     for i, colour in enumerate(_uavs(flown)):
-        values, line = error[:, :, i][results.scored[:, :, i]], {"color": colour}
+        values, line = error[:, :, i][results.worlds.scored[:, :, i]], {"color": colour}
         axes.boxplot(
             [values],
             positions=[i],
@@ -230,14 +230,14 @@ def cdf(flown: Flown) -> Figure:
     title = f"Distribution of the RMSE · {results.runs} runs"
     figure, (left, right) = _panels(2, 4.4, title, sharey=True)
     if SHOWN in results.agents:
-        tracks = metrics.rmse_per_track(results.agents[SHOWN].error, results.scored)
+        tracks = metrics.rmse_per_track(results.agents[SHOWN].error, results.worlds.scored)
         for i, colour in enumerate(_uavs(flown)):
             _steps(left, tracks[:, i], color=colour, linewidth=1.4, label=_name(i))
             left.axvline(tracks[:, i].mean(), color=colour, linestyle="--", linewidth=0.8)
         left.legend(loc="lower right")
     for agent, look in _LINES.items():
         if agent in results.agents:
-            values = metrics.rmse_per_run(results.agents[agent].error, results.scored)
+            values = metrics.rmse_per_run(results.agents[agent].error, results.worlds.scored)
             _steps(right, values, label=paper.METHODS[agent], **look)
     if results.bound is not None:
         right.axvline(results.bound.rmse, label="posterior bound", **BOUND)

@@ -8,7 +8,7 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import Results
+from training.evaluation.results import Evaluation
 from training.reproduce.cost import Cost
 from training.reproduce.pfnn.in_flight import InFlight
 from training.reproduce.verdicts import Claim
@@ -21,27 +21,27 @@ class Flown:
     """``tables``: all agents over the tables' runs; ``cdf``: those of table 4 over figure 9's;
     ``cost`` of those of table 5; ``learning``: None if ``pfnn`` was not wanted."""
 
-    tables: Results
-    cdf: Results
+    tables: Evaluation
+    cdf: Evaluation
     cost: dict[str, Cost]
     learning: InFlight | None
 
     def rmse(self, agent: str) -> Floats:
         """[R], m."""
-        return metrics.rmse_per_run(self.error(agent), self.tables.scored)
+        return metrics.rmse_per_run(self.error(agent), self.tables.worlds.scored)
 
     def largest(self, agent: str) -> Floats:
         """[R]: mean over UAVs of the largest error, m."""
-        return np.where(self.tables.scored, self.error(agent), 0.0).max(1).mean(1)
+        return np.where(self.tables.worlds.scored, self.error(agent), 0.0).max(1).mean(1)
 
     def mean(self, agent: str) -> Floats:
         """[R]: mean error, m."""
-        return metrics.mean_per_run(self.error(agent), self.tables.scored)
+        return metrics.mean_per_run(self.error(agent), self.tables.worlds.scored)
 
     def particles(self, agent: str) -> Floats | None:
         """[R], None for what has no particles."""
         values = self.tables.agents[agent].series.get("particles")
-        return None if values is None else metrics.mean_per_run(values, self.tables.scored)
+        return None if values is None else metrics.mean_per_run(values, self.tables.worlds.scored)
 
     def error(self, agent: str) -> Floats:
         """[R, K, N], m."""

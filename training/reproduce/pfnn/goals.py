@@ -70,20 +70,20 @@ def goals() -> Iterator[Goal]:
         yield Goal(agent, "default", "none lost")
     yield Goal("pfnn", "default", "not worse", other="apf")
     for variant in ("default", "uniform"):
-        yield Goal("pfnn_trust", variant, "ratio at most", limit=1.05, other="apf")
-    yield Goal("pfnn_trust", "nlos", "ratio at most", limit=0.55, other="apf")
-    yield Goal("pfnn_trust", "nlos", "at most", "rmse_after_10s", 0.040)
-    yield Goal("pfnn_trust", "false", "at most", limit=0.045)
-    yield Goal("pfnn_trust", "false", "below", other=_HUBER)
+        yield Goal("pf_trust", variant, "ratio at most", limit=1.05, other="apf")
+    yield Goal("pf_trust", "nlos", "ratio at most", limit=0.55, other="apf")
+    yield Goal("pf_trust", "nlos", "at most", "rmse_after_10s", 0.040)
+    yield Goal("pf_trust", "false", "at most", limit=0.045)
+    yield Goal("pf_trust", "false", "below", other=_HUBER)
     for variant in _HARD:
-        yield Goal("pfnn_trust", variant, "ratio at most", limit=0.85, other=_HUBER)
-        yield Goal("pfnn_trust", variant, "typical ratio", limit=0.85, other=_HUBER)
-        yield Goal("pfnn_trust", variant, "below", other=_HUBER)
+        yield Goal("pf_trust", variant, "ratio at most", limit=0.85, other=_HUBER)
+        yield Goal("pf_trust", variant, "typical ratio", limit=0.85, other=_HUBER)
+        yield Goal("pf_trust", variant, "below", other=_HUBER)
     for variant in _HARD[:2]:
-        yield Goal("pfnn_trust", variant, "not worse", other=_GATE)
-    yield Goal("pfnn_trust", "hard", "at most", "nees", 4.0)
+        yield Goal("pf_trust", variant, "not worse", other=_GATE)
+    yield Goal("pf_trust", "hard", "at most", "nees", 4.0)
     for variant in ("default", "uniform", "nlos", "false", *_HARD):
-        yield Goal("pfnn_trust", variant, "none lost")
+        yield Goal("pf_trust", variant, "none lost")
 
 
 def outcomes(found: Cells, agents: Sequence[str]) -> list[Outcome]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from agents.registry import make
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
-from training.learning.pfnn_online import learn_in_flight
+from training.learning.pfnn_online import learn_online
 from training.reproduce.identity import code_of
 from training.reproduce.store import Store
 from training.reproduce.study import Piece, Variant
@@ -31,7 +31,7 @@ def learned(store: Store, variant: Variant, seed: int, runs: int, tell: Progress
         "code": code_of(make("pfnn", variant.build()), "training.learning.pfnn_online"),
     }
     if not store.has(name, settings):
-        flown = learn_in_flight(variant.build(), runs, seed, tell)
+        flown = learn_online(variant.build(), runs, seed, tell)
         arrays = {key: getattr(flown, key).numpy() for key in ("error", "count", "loss")}
         store.save(name, settings, arrays, {})
     arrays, _ = store.load(name, settings)

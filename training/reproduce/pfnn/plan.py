@@ -18,7 +18,7 @@ ROBUST_AGENTS = (
     "apf",
     "pfnn",
     "ekf_trust",
-    "pfnn_trust",
+    "pf_trust",
 )
 _FULL = (
     *("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20"),

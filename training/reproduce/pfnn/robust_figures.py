@@ -20,7 +20,7 @@ from training.reproduce.study import Variant
 FILES = ("robustness.png", "robustness_paired.png")
 REFERENCE = "ekf:robust=huber"
 _WORST = 30.0  # × the bound: what lies beyond has the same colour
-_SHOWN = ("apf", "pfnn_trust", "ekf_trust", "ekf:robust=gate", "ekf_joint")
+_SHOWN = ("apf", "pf_trust", "ekf_trust", "ekf:robust=gate", "ekf_joint")
 _SHADES = LinearSegmentedColormap.from_list("shades", (FLOOR, "#9ecae9", "#0072B2", "#0b1f3a"))
 _WIDEST = 100.0  # %: differences beyond are drawn at the edge
 
@@ -110,7 +110,7 @@ def heat_map(
 def forest(found: Cells, variants: Sequence[Variant], agents: Sequence[str]) -> Figure:
     """Paired differences to the reference in per cent of its mean RMSE, with intervals."""
     shown = [agent for agent in _SHOWN if agent in agents]
-    shown += [a for a in agents if a.startswith("pfnn_trust:")]
+    shown += [a for a in agents if a.startswith("pf_trust:")]
     rows = [variant for variant in variants if REFERENCE in found[variant.key]]
     figure = Figure(figsize=(7.5, 1.6 + 0.36 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)

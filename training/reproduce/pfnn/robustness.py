@@ -9,7 +9,7 @@ import numpy as np
 
 from training.evaluation import metrics
 from training.evaluation.metrics import Difference, Floats
-from training.evaluation.results import Results, short, table
+from training.evaluation.results import Evaluation, short, table
 from training.reproduce.pfnn.plan import runs_in
 from training.reproduce.study import Study, Variant
 
@@ -27,8 +27,8 @@ Row = dict[str, Any]
 class Cell:
     """One agent in one variant: figures, and what of each run they are made of."""
 
-    def __init__(self, results: Results, agent: str) -> None:
-        one, scored = results.agents[agent], results.scored
+    def __init__(self, results: Evaluation, agent: str) -> None:
+        one, scored = results.agents[agent], results.worlds.scored
         self.rmse: Floats = metrics.rmse_per_run(one.error, scored)
         lost = metrics.lost(one.error, scored, results.dt, results.lost_beyond)
         self.figures: dict[str, Any] = {
@@ -36,8 +36,8 @@ class Cell:
             for key, value in results.summary["agents"][agent].items()
             if key not in ("per_uav_rmse", "diagnostics", "ms_per_step")
         }
-        self.figures |= {"lost_uavs": int(lost.sum()), "raised_runs": one.raised}
-        self.raised = one.message
+        self.figures |= {"lost_uavs": int(lost.sum()), "raised_runs": len(one.messages)}
+        self.raised = one.messages[0] if one.messages else None
 
 
 Cells = dict[str, dict[str, Cell]]  # by variant's key, then agent

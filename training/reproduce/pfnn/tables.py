@@ -30,7 +30,7 @@ def table_3(flown: Flown) -> Table:
     header = ["UAV"]
     for column in ("RMSE", "mean", "max"):
         header += [f"{column}, paper", f"{column}, ours"]
-    lines, scored = [], flown.tables.scored
+    lines, scored = [], flown.tables.worlds.scored
     errors = flown.tables.agents["pfnn"].error if "pfnn" in flown.tables.agents else None
     for i, (name, row) in enumerate(paper.TABLE_3.items()):
         ours: Iterable[str] = (DASH,) * 3
@@ -71,7 +71,7 @@ def table_4(flown: Flown) -> Table:
     blank = [DASH] * len(header)
     if flown.learning is not None:
         error = flown.learning.error
-        scored = flown.tables.scored[:, : error.shape[1]]
+        scored = flown.tables.worlds.scored[:, : error.shape[1]]
         line = [paper.METHODS["pfnn"], LEARNING, *blank[2:]]
         largest = np.where(scored, error, 0.0).max(1).mean(1)
         line[3], line[5], line[7], line[9] = map(

@@ -39,7 +39,7 @@ def layouts(found: Mapping[str, Teams]) -> Figure:
             if agent not in there:
                 continue
             one = there[agent]
-            truth, scored = one.results.truth[0, -1] / 1e3, one.scored[0, -1]
+            truth, scored = one.results.worlds.truth[0, -1] / 1e3, one.scored[0, -1]
             found_at = truth + one.one.offset[0, -1] / 1e3
             _dots(axes, truth[scored], s=26, facecolors="none", edgecolors="#aaaaaa", lw=0.8)
             _dots(axes, truth[~scored], s=16, marker="^", color=MUTED)
@@ -61,7 +61,7 @@ def maps(there: Teams) -> Figure:
         if agent not in there:
             continue
         one = there[agent]
-        place, error = one.results.truth[one.scored] / 1e3, one.error[one.scored]
+        place, error = one.results.worlds.truth[one.scored] / 1e3, one.error[one.scored]
         top = float(np.quantile(error, 0.98))
         picture = axes.hexbin(
             place[:, 0],
@@ -106,7 +106,7 @@ def tracks(one: Runs) -> Figure:
     late = scored[scored >= _FROM]
     shown = (late if len(late) >= 4 else scored)[:4]
     figure, grid = panels(2, len(shown), (2.9 * len(shown), 5.6), "Estimated tracks")
-    truth = one.results.truth[0]
+    truth = one.results.worlds.truth[0]
     found = truth + one.one.offset[0]
     for column, uav in enumerate(shown):
         start = truth[0, uav]

@@ -153,7 +153,7 @@ def _fly_links(localizer: Localizer, variant: Variant, seed: int, tell: Progress
         world.advance(estimate.action())
         observation = world.observation()
         tell("links", k + 1, steps)
-    arrays["error"][:, : scenario.guides] = np.nan
+    arrays["error"][:, : scenario.anchor_uavs] = np.nan
     return arrays
 
 

@@ -58,7 +58,7 @@ class Runs(AgentRuns):
     @cached_property
     def fge(self) -> Floats:
         """[R]: error of the distances between UAVs, m."""
-        truth, offset, scored = self.results.truth, self.one.offset, self.scored
+        truth, offset, scored = self.results.worlds.truth, self.one.offset, self.scored
         return np.array(
             [
                 metrics.formation_error(truth[r : r + 1], offset[r : r + 1], scored[r : r + 1])

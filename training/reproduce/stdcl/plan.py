@@ -286,7 +286,7 @@ class Plan:
                     "tiers-cv",
                     "TIERS without velocities",
                     "replay-tiers-v0",
-                    (later, ("process", "constant_velocity"), ("guides", (5, 4))),
+                    (later, ("process", "constant_velocity"), ("anchor_robots", (5, 4))),
                 ),
                 ("miluv", "MILUV: three UAVs", "replay-miluv-v0", ()),
             )

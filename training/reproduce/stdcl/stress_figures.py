@@ -70,7 +70,7 @@ def confidence(found: By, bounds: ByBounds) -> Figure:
 
 def degree(one: Runs) -> float:
     """Mean number of UAVs within reach, over the runs' first, middle and last step."""
-    truth = one.results.truth
+    truth = one.results.worlds.truth
     places = truth[:, [0, truth.shape[1] // 2, -1]].reshape(-1, *truth.shape[2:])
     apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
     return float((apart <= one.radius).sum(-1).mean() - 1)

@@ -1,4 +1,4 @@
-"""Learning after the flight: every sample once a pass, in an order of the seed's and epoch's."""
+"""Learning after the episode: every sample once a pass, in an order of the seed's and epoch's."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,17 +8,17 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from training.learning.collectors import Flights
-from training.learning.offline import offline_trainer
+from training.learning.collectors import EpochCollector
+from training.learning.replay_buffer import replay_buffer_trainer
 
 PASSES, MINIBATCH, STEPS = 3, 4, 11
 
 
-class Told(LossModule):
-    """A loss that remembers what it was asked of."""
+class Recording(LossModule):
+    """A loss that remembers its batches."""
 
     in_keys = ["number"]  # noqa: RUF012
-    out_keys = ["loss_told"]  # noqa: RUF012
+    out_keys = ["loss_model"]  # noqa: RUF012
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Told(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         self.seen.append(tensordict["number"].tolist())
         x = tensordict["number"].float().unsqueeze(-1)
-        return TensorDict({"loss_told": self.model(x).square().mean()})
+        return TensorDict({"loss_model": self.model(x).square().mean()})
 
 
 class Logger:
@@ -41,7 +41,7 @@ class Logger:
         self.values.append((name, float(value)))
 
 
-class Flight:
+class Episode:
     """One batch of ``STEPS`` steps, numbered from a hundred of the epoch's on."""
 
     def __init__(self, epoch: int) -> None:
@@ -55,10 +55,10 @@ class Flight:
         pass
 
 
-def trained(seed: int, epochs: int, skipped: int = 0) -> tuple[Told, Logger, list[Tensor]]:
-    """What the loss met, what was logged, and the weight that each epoch's figures were said of."""
+def trained(seed: int, epochs: int, skipped: int = 0) -> tuple[Recording, Logger, list[Tensor]]:
+    """What the loss met, what was logged, and the weight that each epoch's figures are of."""
     torch.manual_seed(0)
-    loss, weights = Told(), []
+    loss, weights = Recording(), []
 
     def odd(batch: TensorDictBase) -> TensorDict:
         rows = batch.flatten()
@@ -69,15 +69,15 @@ def trained(seed: int, epochs: int, skipped: int = 0) -> tuple[Told, Logger, lis
         assert not torch.is_grad_enabled()
         return {"count": len(rows), "mean": rows["number"].double().mean()}
 
-    flights = Flights(Flight, epochs)
-    flights.epoch = skipped
-    trainer = offline_trainer(
-        flights,
+    collector = EpochCollector(Episode, epochs)
+    collector.epoch = skipped
+    trainer = replay_buffer_trainer(
+        collector,
         loss,
         odd,
         figures,
         learning_rate=0.01,
-        most=STEPS,
+        capacity=STEPS,
         minibatch=MINIBATCH,
         passes=PASSES,
         seed=seed,
@@ -114,7 +114,7 @@ def test_figures_are_of_all_samples_and_of_weights_before_the_epoch() -> None:
     assert found == [5.0, 105.0]
     assert [value for name, value in logger.values if name == "count"] == [5.0, 5.0]
     torch.manual_seed(0)
-    assert torch.equal(weights[0], Told().model.weight)
+    assert torch.equal(weights[0], Recording().model.weight)
     after_one = trained(0, 1)[0].model.weight
     assert torch.equal(weights[1], after_one)
     assert not torch.equal(weights[0], weights[1])

@@ -13,8 +13,8 @@ from coloc_env.datasets.replay import (
     recorded_odometry,
 )
 from coloc_env.network import Network
-from coloc_env.scenario import Prior, Process, Scenario
-from coloc_env.scenarios.replay import cut
+from coloc_env.scenario import Prior, Process, Reward, Scenario
+from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import AnchorRanging, Odometry, RangeNoise, Sensor
 
 
@@ -26,16 +26,15 @@ def corrected(recording: Recording, delay: float, bias: float) -> Recording:
     return replace(recording, streams={**recording.streams, "anchor_ranges": (table,)})
 
 
-def ranging_grid(
-    recording: Recording, dt: float, span: tuple[float, float] | None, margin: float
-) -> Grid:
+def ranging_grid(recording: Recording, replay: ReplayOptions, margin: float) -> Grid:
     """Steps ``margin`` s after the usual time of a range, so that it arrives fresh but, if it is
     late by less than that, in its own step."""
+    dt = replay.dt
     grid = common_grid(recording, dt, ("anchor_ranges",))
     period, time = round(dt * 1e9), recording.streams["anchor_ranges"][0].time
     usual = int(np.median((time - time[0] + period // 2) % period)) - period // 2
     later = (int(time[0]) + usual + round(margin * 1e9) - grid.start) % period
-    return cut(Grid(grid.start + later, dt, grid.count - 1), span)
+    return replay.cut(Grid(grid.start + later, dt, grid.count - 1))
 
 
 def anchor_scenario(
@@ -45,7 +44,7 @@ def anchor_scenario(
     prior: Prior,
     process: Process,
     range_std: float,
-    reward: str,
+    reward: Reward,
     odometry: Odometry | None = None,
 ) -> Scenario:
     """One tag with ranges to anchors, and with odometry if there is a belief about it."""

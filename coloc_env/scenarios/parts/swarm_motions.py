@@ -1,4 +1,4 @@
-"""How the swarm of ``swarm-v0`` may fly: what its networks learn from, and what they never saw."""
+"""Motions of ``swarm-v0``."""
 
 import math
 from typing import Literal
@@ -29,8 +29,6 @@ def swarm_motion(
     Accelerations are at most 15 m/s², wall reflections and the new targets of ``random`` apart.
     Raises ValueError for a speed at which turns of that acceleration do not fit the boxes.
     """
-    if not v_max > 0:
-        raise ValueError(f"v_max={v_max} is not allowed: a speed in m/s > 0")
     if kind == "random":
         return RandomVelocity(v_max, boxes=boxes)
     if kind == "line":

@@ -1,0 +1,213 @@
+"""The run record: all that is kept of runs, as numpy arrays, from here to tables, figures, studies.
+
+R runs, K steps, N UAVs; lengths in m, world frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from agents.localizer import Localizer
+from coloc_env.scenario import Scenario
+from training.evaluation.metrics import Flags, Floats
+from training.evaluation.rollout import Breakdown, Step, rollout
+from training.evaluation.team import team_figures
+
+Arrays = dict[str, np.ndarray]
+Facts = dict[str, Any]
+_SERIES = "series."
+
+
+@dataclass(frozen=True, eq=False)
+class Worlds:
+    """The worlds that were met, seeded ``seed`` … ``seed`` + R − 1, the same for every agent.
+
+    ``truth`` [R, K, N, d]; ``attitude`` [K, N, a] of the first run (quaternion wxyz, body to world,
+    or heading in rad); ``scored`` [R, K, N]: where estimates count.
+    """
+
+    seed: int
+    truth: Floats
+    attitude: Floats
+    scored: Flags
+
+    def to_arrays(self) -> Arrays:
+        return {"truth": self.truth, "attitude": self.attitude, "scored": self.scored}
+
+    @classmethod
+    def from_arrays(cls, seed: int, arrays: Mapping[str, np.ndarray]) -> Worlds:
+        return cls(seed, arrays["truth"], arrays["attitude"], arrays["scored"])
+
+    @staticmethod
+    def cat(parts: Sequence[Worlds]) -> Worlds:
+        """Blocks of runs one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        return Worlds(
+            parts[0].seed,
+            np.concatenate([part.truth for part in parts]),
+            parts[0].attitude,
+            np.concatenate([part.scored for part in parts]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """R runs of one agent.
+
+    ``offset`` p̂ − p [R, K, N, d] and ``error`` its length [R, K, N]; ``nees`` [R, K, N] of the
+    position, NaN where the covariance is not positive definite; ``broken`` [R]: runs with NaN,
+    infinity or a numerical error; ``messages`` of such errors, one a run that raised one;
+    ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
+    run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1, one thread.
+    """
+
+    worlds: Worlds
+    offset: Floats
+    error: Floats
+    nees: Floats
+    broken: Flags
+    messages: tuple[str, ...] = ()
+    series: dict[str, Floats] = field(default_factory=dict)
+    ms_per_step: float | None = None
+
+    def to_arrays(self) -> tuple[Arrays, Facts]:
+        """The agent's own arrays, and facts that JSON can hold; the worlds are not among them."""
+        arrays = {name: getattr(self, name) for name in ("offset", "error", "nees", "broken")}
+        arrays |= {_SERIES + name: values for name, values in self.series.items()}
+        return arrays, {"messages": list(self.messages), "ms_per_step": self.ms_per_step}
+
+    @classmethod
+    def from_arrays(
+        cls, worlds: Worlds, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]
+    ) -> RunRecord:
+        """What ``to_arrays`` made; arrays that are not a record's are left out."""
+        return cls(
+            worlds,
+            arrays["offset"],
+            arrays["error"],
+            arrays["nees"],
+            arrays["broken"],
+            tuple(facts["messages"]),
+            {
+                name.removeprefix(_SERIES): values
+                for name, values in arrays.items()
+                if name.startswith(_SERIES)
+            },
+            facts["ms_per_step"],
+        )
+
+    @staticmethod
+    def cat(parts: Sequence[RunRecord], worlds: Worlds | None = None) -> RunRecord:
+        """Blocks of runs one after the other, in ``worlds`` (default: the blocks' own)."""
+        if len(parts) == 1:
+            return parts[0] if worlds is None else replace(parts[0], worlds=worlds)
+        blank = np.full((1, *parts[0].error.shape[1:]), np.nan, np.float32)
+
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        def series(name: str) -> np.ndarray:
+            every = [
+                part.series.get(name, np.broadcast_to(blank, part.error.shape)) for part in parts
+            ]
+            return np.concatenate(every)
+
+        return RunRecord(
+            Worlds.cat([part.worlds for part in parts]) if worlds is None else worlds,
+            joined("offset"),
+            joined("error"),
+            joined("nees"),
+            joined("broken"),
+            tuple(message for part in parts for message in part.messages),
+            {
+                name: series(name)
+                for name in dict.fromkeys(n for part in parts for n in part.series)
+            },
+            parts[0].ms_per_step,
+        )
+
+
+def record(
+    localizer: Localizer,
+    scenario: Scenario,
+    seeds: Tensor,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> RunRecord:
+    """The runs of some consecutive seeds, in one batch as long as the localizer raises nothing.
+
+    Where it does, the batch is halved until it is known whose run it is; that run goes on with its
+    last estimates. ``progress(run_steps)`` is called as steps are done.
+    """
+    try:
+        return _recorded(localizer, scenario, seeds, progress, None)
+    except Breakdown as breakdown:
+        progress(-breakdown.k * len(seeds))
+        if len(seeds) > 1:
+            halves = seeds.tensor_split(2)
+            return RunRecord.cat([record(localizer, scenario, half, progress) for half in halves])
+        found = _recorded(localizer, scenario, seeds, progress, breakdown.k)
+        return replace(found, broken=np.ones(1, bool), messages=(str(breakdown),))
+
+
+def _recorded(
+    localizer: Localizer,
+    scenario: Scenario,
+    seeds: Tensor,
+    progress: Callable[[int], None],
+    stop: int | None,
+) -> RunRecord:
+    """A batch of runs; from step ``stop`` on the last estimates stand."""
+    dim, shape = scenario.arena.dim, (len(seeds), scenario.horizon, scenario.arena.n_uavs)
+    truth = torch.zeros(*shape, dim, dtype=torch.float64)
+    attitude = torch.zeros(*shape[1:], 4 if dim == 3 else 1, dtype=torch.float64)
+    offset, error = torch.zeros(*shape, dim), torch.zeros(shape)
+    consistency = torch.full(shape, torch.nan)
+    scored, broken = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape[0], dtype=torch.bool)
+    series: dict[str, Tensor] = {}
+    for step in rollout(localizer, scenario, seeds, stop=stop):
+        k, world = step.k, step.world
+        truth[:, k], attitude[k] = world.truth.position, world.truth.attitude[0]
+        apart = step.action[..., :dim] - world.truth.position
+        offset[:, k] = apart.to(torch.float32)
+        error[:, k], scored[:, k] = world.score(step.action)
+        broken |= (~step.finite & world.alive).any(-1)
+        if step.estimate is not None:
+            consistency[:, k] = nees(apart, step.estimate.covariance.double()).to(torch.float32)
+            for name, value in _own_figures(localizer, step).items():
+                blank = torch.full(shape, torch.nan)
+                series.setdefault(name, blank)[:, k] = value.to(torch.float32)
+        progress(len(seeds))
+    return RunRecord(
+        Worlds(int(seeds[0]), truth.numpy(), attitude.numpy(), scored.numpy()),
+        offset.numpy(),
+        error.numpy(),
+        consistency.numpy(),
+        broken.numpy(),
+        series={name: values.numpy() for name, values in series.items()},
+    )
+
+
+def _own_figures(localizer: Localizer, step: Step) -> dict[str, Tensor]:
+    """A method's own figures at a step, and how far it is off about the team, if it says."""
+    poses = localizer.team(step.belief)
+    figures = localizer.diagnostics(step.belief)
+    return figures if poses is None else figures | team_figures(poses, step.world.truth)
+
+
+def nees(
+    offset: Float64[Tensor, "*s d"], covariance: Float64[Tensor, "*s d d"]
+) -> Float64[Tensor, "*s"]:
+    """Normalized estimation error squared eᵀ P⁻¹ e; NaN where P is not positive definite."""
+    root, wrong = torch.linalg.cholesky_ex(torch.nan_to_num(covariance))
+    scaled = torch.linalg.solve_triangular(root, offset.unsqueeze(-1), upper=False)[..., 0]
+    squared = (scaled * scaled).sum(-1)
+    good = (wrong == 0) & squared.isfinite()
+    return torch.where(good, squared, torch.nan)
