@@ -16,7 +16,7 @@ from training.evaluation.metrics import Floats
 from training.reproduce.results import Results
 
 Drawing = Callable[[Results], Figure | None]  # its docstring is the caption; None: nothing to draw
-# Colours that all eyes tell apart.
+# Colours that all eyes distinguish.
 PALETTE = ("#CC79A7", "#56B4E9", "#882255", "#7F7F1F", "#332288", "#AA4499", "#999999", "#44AA99")
 
 

@@ -18,7 +18,7 @@ from training.reproduce.nnhpff.tables import detections, kidnapped
 from training.reproduce.results import Results
 from training.reproduce.verdicts import interval
 
-# Colours that all eyes tell apart, the same in every figure.
+# Colours that all eyes distinguish, the same in every figure.
 _COLOURS = {"pf": "#0072B2", "hpff": "#E69F00", "nnhpff": "#D55E00", "ekf": "#009E73"}
 _NAMES = {"pf": "PF", "hpff": "HPFF", "nnhpff": "NN-HPFF"}
 

@@ -25,7 +25,7 @@ from training.reproduce.verdicts import interval
 SHOWN = "pfnn"  # whose figures 3 to 8 are
 _ACROSS = 3  # panels beside each other
 _ACCENT, _CALM = rgb("#D55E00"), rgb("#8d9ab0")
-_LINES = {  # figure 9b: as the paper's lines, in colours that all eyes tell apart
+_LINES = {  # figure 9b: as the paper's lines, in colours that all eyes distinguish
     "pfnn": {"color": "#009E73", "linestyle": "-", "linewidth": 2.4},
     "pf500": {"color": "#D55E00", "linestyle": "--", "linewidth": 1.6},
     "pf800": {"color": "#E69F00", "linestyle": "-.", "linewidth": 1.6},

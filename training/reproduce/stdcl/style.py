@@ -19,7 +19,7 @@ from training.reproduce.stdcl.measures import nrmse, radius
 from training.reproduce.verdicts import interval
 from training.reproduce.work import POSTERIOR, SNAPSHOT, WORLD
 
-# Colours that all eyes tell apart.
+# Colours that all eyes distinguish.
 _STYLES: dict[str, tuple[str, str, Any]] = {
     "mds": ("MDS-MAP", "#999999", "-"),
     "fcmds": ("FC-MDS", "#56B4E9", "-"),
