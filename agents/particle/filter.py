@@ -8,7 +8,7 @@ Algorithms 1 and 2).
 
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
@@ -29,9 +29,11 @@ from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
+Particles = Annotated[int, Quantity("", 10, 100_000)]
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -54,23 +56,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self,
         believed: Believed,
         *,
-        particles: int,
-        bounds: tuple[int, int] | None = None,
-        seed: int = 0,
+        particles: Particles,
+        bounds: tuple[Particles, Particles] | None = None,
+        seed: Count = 0,
         perturb: Perturb = "liu_west",
         tempering: bool = True,
         proposal: Proposal = "prior",
         robust: str = "none",
-        gate: float = 0.999,
+        gate: OpenShare = 0.999,
         cooperate: bool = True,
         compile: bool = False,
     ) -> None:
         super().__init__(believed)
-        if particles < 10:
-            raise ValueError(f"particles={particles} is not allowed: at least 10")
-        if bounds is not None and not 10 <= bounds[0] <= particles <= bounds[1]:
+        if bounds is not None and not bounds[0] <= particles <= bounds[1]:
             raise ValueError(
-                f"bounds={bounds} is not allowed: low,high with 10 ≤ low ≤ particles ({particles}) "
+                f"bounds={bounds} is not allowed: low,high with low ≤ particles ({particles}) "
                 "≤ high"
             )
         self.particles, self.seed, self.tempering = particles, seed, tempering

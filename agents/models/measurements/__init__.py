@@ -37,7 +37,6 @@ __all__ = [
     "make_measurements",
     "measures",
     "model_of",
-    "nobody",
 ]
 
 _M = TypeVar("_M", bound=Callable[[Any], Measurement])
