@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import heard, make_measurements, nobody
+from agents.models.measurements import heard, make_measurements, no_neighbours
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
 from agents.particle.belief import ParticleBelief, Step, normal, own_keys
@@ -115,7 +115,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[ParticleBelief, Estimate]:
         key, neighbours = (
             noise.fold(belief.key, belief.step),
-            nobody(belief.last[..., : self.process.dim]),
+            no_neighbours(belief.last[..., : self.process.dim]),
         )
         if any(model.cooperative for model in self.models):
             neighbours = heard(self.believed, observation)

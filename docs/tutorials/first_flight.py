@@ -19,8 +19,8 @@ observations, infos = env.reset(seed=1)
 
 # %% [markdown]
 # An observation is a Dict of flat arrays, each with its mask. The reference lists every leaf with
-# its unit and frame. An action is `[position, velocity, log-std]`: the estimate of the state *at the
-# step observed*.
+# its unit and frame. An action is `[position, velocity, log-std]`: the estimate of the state *at
+# the step observed*.
 #
 # A localizer is built from what the team believes, never from the truth. `ParallelPolicy` makes it
 # act in a PettingZoo environment.

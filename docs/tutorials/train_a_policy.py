@@ -31,7 +31,8 @@ chosen = {
     "score_runs": 2,
 }
 known = TRAININGS.options_of("mappo")
-weights = run.start("mappo", {k: v for k, v in chosen.items() if k in known}, folder, lambda *_: None)
+chosen = {name: value for name, value in chosen.items() if name in known}
+weights = run.start("mappo", chosen, folder, lambda *_: None)
 sorted(path.name for path in folder.iterdir())
 
 # %% [markdown]

@@ -80,7 +80,9 @@ class AlphaBeta(Localizer):
         after = Track(position=position, velocity=velocity, batch_size=belief.batch_size)
         covariance = self.std**2 * torch.eye(d).expand(*position.shape, -1)
         estimate = Estimate(
-            position=position, velocity=velocity, covariance=covariance,
+            position=position,
+            velocity=velocity,
+            covariance=covariance,
             batch_size=belief.batch_size,
         )
         return after, estimate
@@ -92,8 +94,10 @@ class AlphaBeta(Localizer):
 # %%
 scenario = make_scenario("indoor-v0", horizon=100)
 found = evaluate(scenario, ["dead_reckoning", "alpha_beta", "alpha_beta:alpha=0.2", "ekf"], runs=3)
-{name: round(figures["rmse_after_10s"] or figures["rmse"], 2)
- for name, figures in found.summary["agents"].items()}
+{
+    name: round(figures["rmse_after_10s"] or figures["rmse"], 2)
+    for name, figures in found.summary["agents"].items()
+}
 
 # %% [markdown]
 # Put into a package with an entry point, it is found by the `coloc` command as well: see
