@@ -3,7 +3,7 @@
 
 from typing import Any
 
-from agents.particle.filter import ParticleFilter
+from agents.particle.filter import ParticleFilter, Particles
 from coloc_env.scenario import Believed
 
 
@@ -20,8 +20,8 @@ class AdaptiveParticleFilter(ParticleFilter):
         self,
         believed: Believed,
         *,
-        particles: int = 300,
-        bounds: tuple[int, int] | None = (100, 800),
+        particles: Particles = 300,
+        bounds: tuple[Particles, Particles] | None = (100, 800),
         **options: Any,
     ) -> None:
         super().__init__(believed, particles=particles, bounds=bounds, **options)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional
 
-from agents.models.measurements import AnchorRanges, nobody
+from agents.models.measurements import AnchorRanges, no_neighbours
 from agents.models.process import Process
 from agents.robust.mahalanobis import chi_square
 from agents.weights import Learned
@@ -36,7 +36,7 @@ def evidence(
     observation: Observation,
 ) -> Evidence:
     """The evidence about a state (its position alone, unless tags have lever arms)."""
-    alone = nobody(state[..., : process.dim])
+    alone = no_neighbours(state[..., : process.dim])
     if model.tags:
         block = model.linearize(process, state, observation, alone, derivatives=False)
         residual, mask = block.residual[..., 0] * block.mask, block.mask
@@ -44,7 +44,7 @@ def evidence(
     else:
         ranges, anchors = model.ends(observation, alone)
         distance = (state[..., None, : process.dim] - anchors).norm(dim=-1)
-        mask = observation["anchor_range_mask"] > 0
+        mask = model.read(observation)[1]
         residual = (ranges - distance) * mask
         squared = residual.square() / model.variance
     return Evidence(squared.sum(-1).float(), residual.abs().float(), mask.sum(-1).float())
@@ -62,8 +62,6 @@ class ChiSquare(Detector):
     """Failed if d is beyond the quantile of χ² with as many degrees of freedom as ranges."""
 
     def __init__(self, quantile: float, most: int) -> None:
-        if not 0 < quantile < 1:
-            raise ValueError(f"quantile={quantile} is not allowed: a probability in (0, 1)")
         limits = [chi_square(quantile, dof) for dof in range(1, most + 1)]
         self.limits = torch.tensor((torch.inf, *limits), dtype=torch.float32)
 

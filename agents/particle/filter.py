@@ -8,7 +8,7 @@ Algorithms 1 and 2).
 
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import heard, make_measurements, nobody
+from agents.models.measurements import heard, make_measurements, no_neighbours
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
 from agents.particle.belief import ParticleBelief, Step, normal, own_keys
@@ -29,9 +29,11 @@ from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
+Particles = Annotated[int, Quantity("", 10, 100_000)]
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -54,23 +56,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self,
         believed: Believed,
         *,
-        particles: int,
-        bounds: tuple[int, int] | None = None,
-        seed: int = 0,
+        particles: Particles,
+        bounds: tuple[Particles, Particles] | None = None,
+        seed: Count = 0,
         perturb: Perturb = "liu_west",
         tempering: bool = True,
         proposal: Proposal = "prior",
         robust: str = "none",
-        gate: float = 0.999,
+        gate: OpenShare = 0.999,
         cooperate: bool = True,
         compile: bool = False,
     ) -> None:
         super().__init__(believed)
-        if particles < 10:
-            raise ValueError(f"particles={particles} is not allowed: at least 10")
-        if bounds is not None and not 10 <= bounds[0] <= particles <= bounds[1]:
+        if bounds is not None and not bounds[0] <= particles <= bounds[1]:
             raise ValueError(
-                f"bounds={bounds} is not allowed: low,high with 10 ≤ low ≤ particles ({particles}) "
+                f"bounds={bounds} is not allowed: low,high with low ≤ particles ({particles}) "
                 "≤ high"
             )
         self.particles, self.seed, self.tempering = particles, seed, tempering
@@ -115,7 +115,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[ParticleBelief, Estimate]:
         key, neighbours = (
             noise.fold(belief.key, belief.step),
-            nobody(belief.last[..., : self.process.dim]),
+            no_neighbours(belief.last[..., : self.process.dim]),
         )
         if any(model.cooperative for model in self.models):
             neighbours = heard(self.believed, observation)

@@ -59,10 +59,6 @@ class HybridFilter(Localizer[HybridBelief]):
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
             raise ValueError("the team has no distances to anchors to judge its filter by")
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"threshold={threshold} is not allowed: a probability in [0, 1]")
-        if patience < 1:
-            raise ValueError(f"patience={patience} is not allowed: at least 1 step")
         self.main: Localizer[Any] = make(main.replace("@", ":"), believed)
         self.auxiliary: Localizer[Any] = make(auxiliary.replace("@", ":"), believed)
         if type(self.main).restarted is Localizer.restarted:

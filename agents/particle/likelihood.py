@@ -35,11 +35,12 @@ def landmark_log_likelihood(
     centre's rotation (R = R̄ + ΔR), which keeps float32 from cancelling.
     """
     d = process.dim
-    weight = observation["landmark_mask"]
+    seen, there = model.read(observation, d)
+    weight = there.to(seen.dtype)
     if trust.weight is not None:
         weight = weight * trust.weight.to(weight.dtype)
     weight = weight.unsqueeze(-1)
-    z = observation["landmarks"].unflatten(-1, (-1, d)) * weight
+    z = seen * weight
     points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
     at = process.rotation(centre)
     if at is None:

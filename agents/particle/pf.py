@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from agents.particle.filter import ParticleFilter
+from agents.particle.filter import ParticleFilter, Particles
 from coloc_env.scenario import Believed
 
 
@@ -15,7 +15,7 @@ class Pf(ParticleFilter):
         self,
         believed: Believed,
         *,
-        particles: int = 5000,
+        particles: Particles = 5000,
         tempering: bool = False,
         **options: Any,
     ) -> None:
@@ -27,7 +27,7 @@ class Pf500(ParticleFilter):
 
     name = "pf500"
 
-    def __init__(self, believed: Believed, *, particles: int = 500, **options: Any) -> None:
+    def __init__(self, believed: Believed, *, particles: Particles = 500, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)
 
 
@@ -36,5 +36,5 @@ class Pf800(ParticleFilter):
 
     name = "pf800"
 
-    def __init__(self, believed: Believed, *, particles: int = 800, **options: Any) -> None:
+    def __init__(self, believed: Believed, *, particles: Particles = 800, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from agents.models.process import Process
-from agents.models.update import Update, iterated_update, linearizer
+from agents.models.update import Update, iterated_update
 from agents.particle import particle_count
 from agents.particle.belief import Step, normal
 from agents.particle.cloud import moments, normalized
@@ -39,8 +39,7 @@ def guided(
     cloud = moments(process, particles, log_weights.exp())
     covariance = cloud.covariance + torch.diag(floor.to(cloud.covariance.device) ** 2)
     prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
-    linearize = linearizer(process, screen.models, now.observation, now.neighbours)
-    return Guide(prior, iterated_update(prior, linearize, screen, _ITERATIONS))
+    return Guide(prior, iterated_update(prior, now.neighbours, screen, _ITERATIONS))
 
 
 def proposed(

@@ -48,8 +48,6 @@ class RobustScreen(Screen):
         self, process: Process, models: Sequence[Measurement], robust: str, probability: float
     ) -> None:
         super().__init__(process, models)
-        if not 0 < probability < 1:
-            raise ValueError(f"gate={probability} is not allowed: a probability in (0, 1)")
         self.methods = _parsed(robust)
         self.probability = probability
         self.judges = bool(self.methods)

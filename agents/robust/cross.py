@@ -93,12 +93,13 @@ def _distances(
     links = (observation["links"] > 0).unsqueeze(2)
     by_slot = (-1, links.shape[-1])
     if isinstance(model, UavRanges):
-        distance, mask, variance = observation["ranges"], "range_mask", model.variance
+        (distance, mask), variance = model.read(observation), model.variance
     else:
         assert isinstance(model, UavRangeBearings)
-        distance, mask = observation["uav_bearings"][..., ::2], "uav_bearing_mask"
+        z, mask = model.read(observation)
+        distance = z[..., 0]
         variance = model.std[0] ** 2
-    reached = (observation[mask] > 0).unflatten(-1, by_slot) & links
+    reached = mask.unflatten(-1, by_slot) & links
     return distance.double().unflatten(-1, by_slot), reached, variance
 
 

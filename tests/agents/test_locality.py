@@ -1,5 +1,6 @@
 """What may reach whom: unheard UAVs, masked values, NaN, silence, failures, ``cooperate=false``."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -189,10 +190,17 @@ def test_silence_leaves_the_motion_model(case: SimpleNamespace, tools: SimpleNam
 # ---------------------------------------------------------------- what goes wrong
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_nan_stays_with_the_uav_that_saw_it(
-    bad: float, case: SimpleNamespace, tools: SimpleNamespace
+def test_nan_stays_with_the_uav_that_saw_it(case: SimpleNamespace, tools: SimpleNamespace) -> None:
+    assert_kept_apart(math.nan, case, tools)
+
+
+def test_infinity_stays_with_the_uav_that_saw_it(
+    sample: SimpleNamespace, tools: SimpleNamespace
 ) -> None:
+    assert_kept_apart(math.inf, sample, tools)
+
+
+def assert_kept_apart(bad: float, case: SimpleNamespace, tools: SimpleNamespace) -> None:
     """For centralized ones: within its world, but for the rounding of systems of another size."""
     if isinstance(case.localizer, SteinFilter):
         pytest.skip("a UAV's motion is what it tells of it; test_cspf has what then holds")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, heard, nobody
+from agents.models.measurements.base import Block, Measurement, Neighbours, heard, no_neighbours
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
@@ -37,7 +37,7 @@ __all__ = [
     "make_measurements",
     "measures",
     "model_of",
-    "nobody",
+    "no_neighbours",
 ]
 
 _M = TypeVar("_M", bound=Callable[[Any], Measurement])

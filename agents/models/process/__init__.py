@@ -51,7 +51,9 @@ def make_process(believed: Believed) -> Process:
         if ins is None:
             raise ValueError("the believed motion is driven by an INS, but the team has none")
         return InsProcess(arena.dim, arena.dt, ins, settings)
-    odometry = believed.sensor(Odometry)
-    if odometry is None:
-        raise ValueError("the believed motion is wheeled, but the team has no odometry")
-    return WheeledProcess(arena.dt, odometry)
+    if isinstance(settings, believed_processes.Wheeled):
+        odometry = believed.sensor(Odometry)
+        if odometry is None:
+            raise ValueError("the believed motion is wheeled, but the team has no odometry")
+        return WheeledProcess(arena.dt, odometry)
+    raise ValueError(f"{type(settings).__name__} motion has no model")

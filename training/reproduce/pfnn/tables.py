@@ -28,7 +28,7 @@ def text(settings: Settings) -> list[str]:
         "paper's table, but they redraw a cloud from the posterior of an extended Kalman filter "
         "where its effective sample size is low.",
         "Particle filters that jitter positions by 0.03 m (`perturb`) lose no UAV only together "
-        "with tempering and that redraw; by itself the jitter does not.",
+        "with tempering and that redraw.",
         "Where the corrector has no detectable effect here, it is because clouds in these worlds "
         "are centimetres wide: a factor within [0.4, 1] hardly differs over such a cloud. Where "
         "clouds are wide, these runs say nothing.",
