@@ -10,10 +10,20 @@ from mkdocs.structure.files import File, Files
 _ROOT = Path(__file__).parents[2]
 _NUMBERED = re.compile(r"\b(?:[Ee]quations?|eqs?\.)\s+(\d+(?:(?: to | and |–|-|, )\d+)*)")
 _PAPERS = {  # the files that implement each paper
-    "PF-NN": ["agents/particle/pfnn.py", "agents/particle/corrector.py", "agents/particle/apf.py"]
-    + ["agents/particle/particle_count.py", "agents/particle/likelihood.py"],
-    "NN-HPFF": ["agents/kalman/emvf.py", "agents/particle/failure.py", "agents/particle/hybrid.py"]
-    + ["agents/particle/hpff.py", "agents/particle/nnhpff.py"],
+    "PF-NN": [
+        "agents/particle/pfnn.py",
+        "agents/particle/corrector.py",
+        "agents/particle/apf.py",
+        "agents/particle/particle_count.py",
+        "agents/particle/likelihood.py",
+    ],
+    "NN-HPFF": [
+        "agents/kalman/emvf.py",
+        "agents/particle/failure.py",
+        "agents/particle/hybrid.py",
+        "agents/particle/hpff.py",
+        "agents/particle/nnhpff.py",
+    ],
     "ST-DCL": ["agents/swarm", "agents/stdcl"],
     "CSPF": ["agents/stein"],
 }
