@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.filter import GaussianFilter
-from agents.models.measurements import Block, Neighbours, heard, make_measurements
+from agents.models.measurements import Block, Neighbours, make_measurements, received
 from agents.models.update import information, iterated_update, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
@@ -66,7 +66,7 @@ class CooperativeEkf(GaussianFilter):
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
         if not self.models:
             return super().update(prior)
-        neighbours = heard(self.believed, prior.observation)
+        neighbours = received(self.believed, prior.observation)
         found = iterated_update(prior, neighbours, self.screen, self.iterations)
         if self.fusion == "naive":
             return found.state, found.covariance, found.memory

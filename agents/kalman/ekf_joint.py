@@ -77,6 +77,7 @@ class JointEkf(Localizer[GaussianBelief]):
         f, q = self.process.linearize(belief.state, u, dt)
         x = self.process.propagate(belief.state, u, dt)
         p = belief.covariance.unflatten(-1, (n, e)).transpose(2, 3)  # [B, N, N, E, E]
+        # P_ij ← F_i P_ij F_jᵀ + δ_ij Q_i
         p = f.unsqueeze(2) @ p @ f.mT.unsqueeze(1) + _diagonal(q).transpose(2, 3)
         p = p.transpose(2, 3).reshape(b, n * e, n * e)
         x, p, memory = self._update(x, p, observation, belief.memory)
@@ -89,8 +90,8 @@ class JointEkf(Localizer[GaussianBelief]):
     def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
         return belief.state
 
-    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
-        return belief.moved(offset)
+    def shifted(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.shifted(offset)
 
     def _update(
         self,
@@ -114,7 +115,7 @@ class JointEkf(Localizer[GaussianBelief]):
             blocks = self._blocks(state, observation)
             judged = blocks
             if self.screen.judges:
-                judged = [self._doubtful(block, updated) for block in blocks]
+                judged = [self._with_partners(block, updated) for block in blocks]
             if iteration == -extra:
                 evidence = self.screen.judge(judged, prior)
             trusts = self.screen.weigh(judged, evidence, iteration == self.iterations - 1)
@@ -160,7 +161,7 @@ class JointEkf(Localizer[GaussianBelief]):
         neighbours = self._neighbours(x)
         return [m.linearize(self.process, x, observation, neighbours) for m in self.models]
 
-    def _doubtful(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
+    def _with_partners(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
         """The block as one UAV alone would judge it: with what its partners do not know of
         themselves as noise."""
         if block.partner is None or block.partner_variance is None:

@@ -37,7 +37,7 @@ _RIDGE = 1e-3  # m⁻²: what keeps a trilateration near the arena's centre wher
 
 class WindowBelief(TensorClass):
     """What was measured in the last M steps, the newest last (zeros before the first), steps taken,
-    and dead reckoning of what a short window cannot tell (attitude, biases); batch (B, N)."""
+    and dead reckoning of what a short window does not observe (attitude, biases); batch (B, N)."""
 
     window: Float32[Tensor, "B N M F"]
     step: Int64[Tensor, "B N"]
@@ -60,7 +60,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     With Z = H̄ x_k + Ḡ w + v stacked over the window and Ξ = Ḡ Q̄ Ḡᵀ + R̄:
     x̂ = (H̄ᵀ Ξ⁻¹ H̄)⁻¹ H̄ᵀ Ξ⁻¹ Z and P = (H̄ᵀ Ξ⁻¹ H̄)⁻¹, h linearized ``iterations`` times. It uses
     what the UAV measures itself and needs no prior but, where the motion model has an attitude (and
-    biases), their dead reckoning. Where the window does not tell the state, P says so.
+    biases), their dead reckoning. Where the window does not observe the state, P is large.
     ``robust=huber`` widens the variance of what is far from the iterate it is linearized about.
     """
 
@@ -105,11 +105,11 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
             batch_size=step.shape,
         )
 
-    def watch(self, belief: WindowBelief, observation: Observation) -> WindowBelief:
+    def advance(self, belief: WindowBelief, observation: Observation) -> WindowBelief:
         row = self._row(observation).unsqueeze(-2)
         reckoned = belief.reckoned
         if self.process.attitude_size:
-            reckoned = self.reckoning.watch(reckoned, observation)
+            reckoned = self.reckoning.advance(reckoned, observation)
         return build(
             WindowBelief,
             belief.step.shape,
@@ -119,7 +119,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         )
 
     def step(self, belief: WindowBelief, observation: Observation) -> tuple[WindowBelief, Estimate]:
-        after = self.watch(belief, observation)
+        after = self.advance(belief, observation)
         return after, gaussian_estimate(self.process, *self.gaussian(after, observation))
 
     def gaussian(

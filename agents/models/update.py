@@ -52,7 +52,7 @@ def posterior(
 def iterated_update(
     prior: Prediction, neighbours: Neighbours, screen: Screen, iterations: int
 ) -> Update:
-    """Iterated (Gauss-Newton) EKF update of a prior, its measurements trusted as a screen says.
+    """Iterated (Gauss-Newton) EKF update of a prior, its measurements weighted by a screen.
 
     Where the prior is broad, the screen's extra iterations come first, and what is trusted in the
     end is then used again from the prior on, in order: see ``ordered_update``.

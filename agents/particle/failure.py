@@ -1,4 +1,4 @@
-"""Has a filter failed? Detectors that look at an estimate and at the distances to anchors."""
+"""Has a filter failed? Detectors by an estimate and the distances to anchors."""
 
 from abc import ABC, abstractmethod
 from copy import deepcopy
@@ -15,13 +15,13 @@ from agents.robust.mahalanobis import chi_square
 from agents.weights import Learned
 from coloc_env.observation import Observation
 
-ANCHORS = 4  # residuals that the network looks at
+ANCHORS = 4  # residuals that the network is fed
 HIDDEN = (10, 5)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What distances to A anchors (of all tags) say of an estimate: d = rᵀ R⁻¹ r of the residuals
+    """Residuals of an estimate to A anchors (of all tags): d = rᵀ R⁻¹ r of the residuals
     r = z − h(x̂), their sizes (m; 0 where nothing was measured), and how many there are."""
 
     distance: Float32[Tensor, "B N"]
@@ -55,7 +55,7 @@ class Detector(ABC):
 
     @abstractmethod
     def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
-        """The probability that it has; a test that knows no probabilities says 0 or 1."""
+        """The probability that it has; a test without probabilities gives 0 or 1."""
 
 
 class ChiSquare(Detector):

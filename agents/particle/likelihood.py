@@ -90,7 +90,7 @@ def log_likelihood(
     neighbours: Neighbours,
     trusts: Sequence[Trust],
 ) -> Float32[Tensor, "B N M"]:
-    """Sum over all sensors' measurements, each trusted as ``trusts`` says; what a neighbour's
+    """Sum over all sensors' measurements, each weighted by ``trusts``; what a neighbour's
     uncertainty adds to a range's variance is taken at the centre."""
     total = torch.zeros_like(particles[..., 0])
     d = process.dim

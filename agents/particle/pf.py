@@ -1,4 +1,7 @@
-"""Particle filters with a fixed number of particles, at the sizes that the papers compare."""
+"""Particle filters with a fixed number of particles, at the sizes that the papers compare.
+
+``pf500`` and ``pf800`` are not bootstrap filters throughout: see ``ParticleFilter``.
+"""
 
 from typing import Any
 
@@ -23,7 +26,9 @@ class Pf(ParticleFilter):
 
 
 class Pf500(ParticleFilter):
-    """SIR particle filter with 500 particles per UAV."""
+    """SIR particle filter with 500 particles per UAV: it tempers the likelihood in the first steps,
+    and later, where few particles are effective, redraws them from an EKF's posterior, with
+    importance weights (``tempering=false``: neither, plain SIR)."""
 
     name = "pf500"
 
@@ -32,7 +37,8 @@ class Pf500(ParticleFilter):
 
 
 class Pf800(ParticleFilter):
-    """SIR particle filter with 800 particles per UAV."""
+    """SIR particle filter with 800 particles per UAV, tempered at first and redrawn from an EKF's
+    posterior as ``pf500`` is."""
 
     name = "pf800"
 

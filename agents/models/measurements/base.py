@@ -35,8 +35,8 @@ def no_neighbours(position: Float[Tensor, "*s d"]) -> Neighbours:
     return Neighbours(none, none, none[..., 0] > 0)
 
 
-def heard(believed: Believed, observation: Observation) -> Neighbours:
-    """Neighbours as their messages tell: past estimates, moved on at their velocity."""
+def received(believed: Believed, observation: Observation) -> Neighbours:
+    """Neighbours by their messages: past estimates, propagated at constant velocity."""
     d = believed.arena.dim
     content = observation["messages"].double().unflatten(-1, (believed.slots, 3 * d))
     known = (observation["message_mask"] > 0) & content.isfinite().all(-1)
@@ -57,7 +57,7 @@ class Block:
     ``variance`` the measurement's own noise (diagonal).
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
     position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
-    ``per_slot``) flattened, and ``mutual`` says that both UAVs hold the very same number.
+    ``per_slot``) flattened, and ``mutual``: both UAVs hold the very same number.
     ``distance`` (m) is that to the other UAV where it is what was measured.
     """
 
@@ -115,8 +115,8 @@ def noise_std(std: float) -> float:
 
 
 class Measurement(ABC):
-    """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` says which of its
-    measurements are there (None: a single one, always)."""
+    """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
+    that marks which of its measurements are there (None: a single one, always)."""
 
     cooperative = False
     mask_leaf: str | None = None

@@ -77,7 +77,7 @@ class LandmarkRangeBearings(Measurement):
 
 
 class UavRangeBearings(Measurement):
-    """Range and bearing to neighbours, whose position is known as well as ``neighbours`` says."""
+    """Range and bearing to neighbours, whose position is uncertain as ``neighbours`` states."""
 
     cooperative = True
     mask_leaf = "uav_bearing_mask"

@@ -125,7 +125,7 @@ class AnchorRanges(_Ranges):
 
 
 class UavRanges(_Ranges):
-    """Distances to neighbours, whose position is known as well as ``neighbours`` says.
+    """Distances to neighbours, whose position is uncertain as ``neighbours`` states.
 
     A neighbour's attitude is not in its message: its tag's lever arm counts as noise.
     """
