@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,17 @@ from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
 _NUMBERED = re.compile(r"\b(?:[Ee]quations?|eqs?\.)\s+(\d+(?:(?: to | and |–|-|, )\d+)*)")
-_PAPERS = {  # the files that implement each paper
-    "PF-NN": ["agents/particle/pfnn.py", "agents/particle/corrector.py", "agents/particle/apf.py"]
-    + ["agents/particle/particle_count.py", "agents/particle/likelihood.py"],
-    "NN-HPFF": ["agents/kalman/emvf.py", "agents/particle/failure.py", "agents/particle/hybrid.py"]
-    + ["agents/particle/hpff.py", "agents/particle/nnhpff.py"],
-    "ST-DCL": ["agents/swarm", "agents/stdcl"],
-    "CSPF": ["agents/stein"],
+_PAPERS = {  # what implements each paper
+    "PF-NN": ("agents/particle/apf.py", "agents/particle/corrector.py", "agents/particle/pfnn.py"),
+    "NN-HPFF": (
+        "agents/kalman/emvf.py",
+        "agents/particle/failure.py",
+        "agents/particle/hpff.py",
+        "agents/particle/hybrid.py",
+        "agents/particle/nnhpff.py",
+    ),
+    "ST-DCL": ("agents/swarm", "agents/stdcl"),
+    "CSPF": ("agents/stein",),
 }
 
 
@@ -39,7 +44,7 @@ def page() -> str:
     return "\n".join(text)
 
 
-def _whole(places: list[str]) -> str:
+def _whole(places: Iterable[str]) -> str:
     return "Its equations have no numbers. The files: " + ", ".join(f"`{p}`" for p in places) + "\n"
 
 

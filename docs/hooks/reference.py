@@ -249,16 +249,14 @@ def trainings() -> str:
 
 def command() -> str:
     """Help of every subcommand, as a page."""
-    import click
     import typer.main
 
     from training.cli.command import app
 
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
+    group: Any = typer.main.get_command(app)
     text = ["# The command\n", "`coloc COMMAND --help` says the same.\n"]
-    for name in group.list_commands(click.Context(group)):
-        text += _subcommand(f"coloc {name}", group.commands[name])
+    for name, one in group.commands.items():
+        text += _subcommand(f"coloc {name}", one)
     return "\n".join(text)
 
 
@@ -269,7 +267,7 @@ def _subcommand(name: str, one: Any) -> list[str]:
         [
             ", ".join(f"`{word}`" for word in each.opts + each.secondary_opts)
             if each.param_type_name == "option"
-            else f"`{each.human_readable_name}`",
+            else f"`{each.metavar or each.name.upper()}`",
             getattr(each, "help", None) or "",
             "" if each.default is None or callable(each.default) else value(each.default),
         ]
