@@ -24,6 +24,9 @@ _PAPERS = {  # what implements each paper
 }
 
 
+_MODULE = "the module"
+
+
 def on_files(files: Files, config: Any, **_: Any) -> Files:
     files.append(File.generated(config, "explanation/equations.md", content=page()))
     return files
@@ -37,6 +40,8 @@ def page() -> str:
     ]
     for paper, places in _PAPERS.items():
         rows = sorted({row for place in places for row in _rows(_ROOT / place)})
+        named = {row[:3] for row in rows if row[3] != _MODULE}
+        rows = [row for row in rows if row[3] != _MODULE or row[:3] not in named]
         text += [f"## {paper}\n"]
         lines = [f"| {numbers} | `{where}` | `{name}` |" for _, numbers, where, name in rows]
         header = ["| equation | file | in |", "| --- | --- | --- |"]
@@ -57,7 +62,7 @@ def _rows(place: Path) -> list[tuple[int, str, str, str]]:
         for match in _NUMBERED.finditer(source):
             line = source.count("\n", 0, match.start()) + 1
             inside = [name for first, last, name in owners if first <= line <= last]
-            name = inside[-1] if inside else "the module"
+            name = inside[-1] if inside else _MODULE
             first = int(re.match(r"\d+", match[1])[0])  # type: ignore[index]
             found.append((first, match[1], file.relative_to(_ROOT).as_posix(), name))
     return found
