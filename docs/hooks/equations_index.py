@@ -11,7 +11,13 @@ from mkdocs.structure.files import File, Files
 _ROOT = Path(__file__).parents[2]
 _NUMBERED = re.compile(r"\b(?:[Ee]quations?|eqs?\.)\s+(\d+(?:(?: to | and |–|-|, )\d+)*)")
 _PAPERS = {  # what implements each paper
-    "PF-NN": ("agents/particle/apf.py", "agents/particle/corrector.py", "agents/particle/pfnn.py"),
+    "PF-NN": (
+        "agents/particle/apf.py",
+        "agents/particle/corrector.py",
+        "agents/particle/likelihood.py",
+        "agents/particle/particle_count.py",
+        "agents/particle/pfnn.py",
+    ),
     "NN-HPFF": (
         "agents/kalman/emvf.py",
         "agents/particle/failure.py",
