@@ -3,32 +3,37 @@
 import html
 import io
 import re
+import zlib
 from functools import cache
 from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.font_manager import FontProperties
 from matplotlib.mathtext import math_to_image
 
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.+?)\\\)</span>', re.DOTALL)
 _DISPLAY = re.compile(r'<div class="arithmatex">\s*\\\[(.+?)\\\]\s*</div>', re.DOTALL)
-_SIZE = 12.0  # points
+_SIZE = 11.0  # points
 
 
 @cache
 def picture(latex: str) -> str:
-    """An ``<svg>`` of an equation; its text stays with it. Raises ValueError for what Matplotlib
-    cannot set."""
+    """An ``<svg>`` of an equation, with its source as the title. Raises ValueError for what
+    Matplotlib cannot set."""
     file = io.StringIO()
     font = FontProperties(size=_SIZE, math_fontfamily="cm")
-    math_to_image(f"${latex}$", file, prop=font, format="svg")
+    with rc_context({"savefig.transparent": True, "svg.hashsalt": "coloc"}):
+        depth = math_to_image(f"${latex}$", file, prop=font, dpi=72, format="svg")
     drawn = file.getvalue()
-    drawn = drawn[drawn.index("<svg") :].replace("<svg", '<svg class="equation" role="img"', 1)
-    drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.DOTALL)
-    unique = f"e{abs(hash(latex)):x}-"  # identifiers of glyphs must differ within a page
-    drawn = re.sub(r'id="', f'id="{unique}', drawn)
-    drawn = re.sub(r'href="#', f'href="#{unique}', drawn)
-    drawn = re.sub(r"url\(#", f"url(#{unique}", drawn)
-    return re.sub(r"(<svg[^>]*>)", rf"\1<title>{html.escape(latex)}</title>", drawn, count=1)
+    drawn = re.sub(r"<(metadata|style).*?</\1>", "", drawn, flags=re.DOTALL)
+    unique = f"e{zlib.crc32(latex.encode()):x}-"  # identifiers must differ within a page
+    drawn = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{unique}", drawn)
+    _, _, inside = drawn[drawn.index("<svg") :].partition(">")
+    width, height = re.findall(r'(?:width|height)="([\d.]+pt)"', drawn[:2000])[:2]
+    box = re.findall(r'viewBox="[^"]+"', drawn)[0]
+    style = f"width:{width};height:{height};vertical-align:-{depth:.1f}pt"
+    title = f"<title>{html.escape(latex)}</title>"
+    return f'<svg class="equation" role="img" {box} style="{style}">{title}{inside}'
 
 
 def on_page_content(content: str, **_: Any) -> str:

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,24 +10,27 @@ from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
 _NUMBERED = re.compile(r"\b(?:[Ee]quations?|eqs?\.)\s+(\d+(?:(?: to | and |–|-|, )\d+)*)")
-_PAPERS = {  # the files that implement each paper
-    "PF-NN": [
-        "agents/particle/pfnn.py",
-        "agents/particle/corrector.py",
+_PAPERS = {  # what implements each paper
+    "PF-NN": (
         "agents/particle/apf.py",
-        "agents/particle/particle_count.py",
+        "agents/particle/corrector.py",
         "agents/particle/likelihood.py",
-    ],
-    "NN-HPFF": [
+        "agents/particle/particle_count.py",
+        "agents/particle/pfnn.py",
+    ),
+    "NN-HPFF": (
         "agents/kalman/emvf.py",
         "agents/particle/failure.py",
-        "agents/particle/hybrid.py",
         "agents/particle/hpff.py",
+        "agents/particle/hybrid.py",
         "agents/particle/nnhpff.py",
-    ],
-    "ST-DCL": ["agents/swarm", "agents/stdcl"],
-    "CSPF": ["agents/stein"],
+    ),
+    "ST-DCL": ("agents/swarm", "agents/stdcl"),
+    "CSPF": ("agents/stein",),
 }
+
+
+_MODULE = "the module"
 
 
 def on_files(files: Files, config: Any, **_: Any) -> Files:
@@ -42,6 +46,8 @@ def page() -> str:
     ]
     for paper, places in _PAPERS.items():
         rows = sorted({row for place in places for row in _rows(_ROOT / place)})
+        named = {row[:3] for row in rows if row[3] != _MODULE}
+        rows = [row for row in rows if row[3] != _MODULE or row[:3] not in named]
         text += [f"## {paper}\n"]
         lines = [f"| {numbers} | `{where}` | `{name}` |" for _, numbers, where, name in rows]
         header = ["| equation | file | in |", "| --- | --- | --- |"]
@@ -49,7 +55,7 @@ def page() -> str:
     return "\n".join(text)
 
 
-def _whole(places: list[str]) -> str:
+def _whole(places: Iterable[str]) -> str:
     return "Its equations have no numbers. The files: " + ", ".join(f"`{p}`" for p in places) + "\n"
 
 
@@ -62,7 +68,7 @@ def _rows(place: Path) -> list[tuple[int, str, str, str]]:
         for match in _NUMBERED.finditer(source):
             line = source.count("\n", 0, match.start()) + 1
             inside = [name for first, last, name in owners if first <= line <= last]
-            name = inside[-1] if inside else "the module"
+            name = inside[-1] if inside else _MODULE
             first = int(re.match(r"\d+", match[1])[0])  # type: ignore[index]
             found.append((first, match[1], file.relative_to(_ROOT).as_posix(), name))
     return found

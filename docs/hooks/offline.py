@@ -10,7 +10,14 @@ _LOADED = re.compile(
 )
 
 
+_DIAGRAMS = re.compile(
+    r'<script type="module">(?:(?!</script>).)*jp-Mermaid.*?</script>', re.DOTALL
+)
+"""What nbconvert adds to notebooks, for diagrams that ours do not have: it would load Mermaid."""
+
+
 def on_post_page(output: str, page: Any, **_: Any) -> str:
+    output = _DIAGRAMS.sub("", output)
     found = _LOADED.search(output)
     if found is not None:
         raise ValueError(f"{page.file.src_uri} loads from elsewhere: {found[0]}")

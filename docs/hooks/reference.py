@@ -19,6 +19,8 @@ from coloc_env.scenario import Scenario
 from coloc_env.sensors import Leaf
 from training.learning.registry import TRAININGS
 
+_OWN = {"override": "General", "option": ""}  # titles of options that belong to no group
+
 
 def on_files(files: Files, config: Any, **_: Any) -> Files:
     pages = {
@@ -70,7 +72,8 @@ def options(known: Mapping[str, Option], kind: str, level: int) -> str:
             for one in known.values()
             if one.group == group
         ]
-        text += [f"{'#' * level} {group or f'{kind.capitalize()}s'}\n"]
+        title = group[:1].upper() + group[1:] if group else _OWN[kind]
+        text += [f"{'#' * level} {title}\n"] if title else []
         text += [groups[group].replace("``", "`") + "\n"] if groups[group] else []
         text += [table([kind, "allowed", "unit", "default"], rows)]
     return "\n".join(text)
@@ -92,6 +95,10 @@ def mask(name: str, leaves: Mapping[str, Leaf]) -> str:
         if f"{stem}_mask" in leaves and name != f"{stem}_mask":
             return f"`{stem}_mask`"
     return ""
+
+
+def unit(leaf: Leaf) -> str:
+    return leaf.unit or ("0 or 1" if (leaf.low, leaf.high) == (0, 1) else "index")
 
 
 def owners(built: Scenario) -> dict[str, tuple[Leaf, str]]:
@@ -164,7 +171,7 @@ def leaves(made: Scenario) -> str:
         [
             f"`{name}`",
             str(leaf.width),
-            leaf.unit or ("0 or 1" if leaf.high == 1 and leaf.low == 0 else "index"),
+            unit(leaf),
             leaf.frame,
             mask(name, names),
             source.replace("SENSORS", "../api/coloc_env.md#sensors"),
@@ -177,7 +184,7 @@ def leaves(made: Scenario) -> str:
 
 def observations() -> str:
     """Every leaf of every scenario."""
-    entries: dict[str, tuple[Leaf, str, str, list[str]]] = {}
+    entries: dict[str, tuple[dict[str, None], Leaf, str, str, list[str]]] = {}
     for name in SCENARIOS:
         made = built(name)
         if made is None:
@@ -185,18 +192,19 @@ def observations() -> str:
         found = owners(made)
         known = {key: leaf for key, (leaf, _) in found.items()}
         for key, (leaf, source) in found.items():
-            entry = entries.setdefault(key, (leaf, source, mask(key, known), []))
-            entry[3].append(f"{name} ({leaf.width})")
+            entry = entries.setdefault(key, ({}, leaf, source, mask(key, known), []))
+            entry[0][unit(leaf)] = None
+            entry[4].append(f"{name} ({leaf.width})")
     rows = [
         [
             f"`{key}`",
-            leaf.unit or ("0 or 1" if leaf.high == 1 and leaf.low == 0 else "index"),
+            " or ".join(units),
             leaf.frame,
             covered,
             source.replace("SENSORS", "api/coloc_env.md#sensors"),
             ", ".join(where),
         ]
-        for key, (leaf, source, covered, where) in sorted(entries.items())
+        for key, (units, leaf, source, covered, where) in sorted(entries.items())
     ]
     header = ["leaf", "unit", "frame", "mask", "from", "in (numbers a UAV)"]
     return "\n".join(
@@ -225,7 +233,7 @@ def registered(registry: Registry, kind: str, served: bool = False) -> str:
         if serves is not None:
             sensors = ", ".join(f"`{sensor.__name__}`" for sensor in serves)
             text += [f"Uses {sensors}, and refuses what it would ignore.\n"]
-        text += [options(registry.options_of(name), kind, 3).replace("### Options\n\n", "")]
+        text += [options(registry.options_of(name), kind, 3)]
     return "\n".join(text)
 
 
@@ -249,27 +257,25 @@ def trainings() -> str:
 
 def command() -> str:
     """Help of every subcommand, as a page."""
-    import click
     import typer.main
 
     from training.cli.command import app
 
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
+    group: Any = typer.main.get_command(app)
     text = ["# The command\n", "`coloc COMMAND --help` says the same.\n"]
-    for name in group.list_commands(click.Context(group)):
-        text += _subcommand(f"coloc {name}", group.commands[name])
+    for name, one in group.commands.items():
+        text += _subcommand(f"coloc {name}", one)
     return "\n".join(text)
 
 
 def _subcommand(name: str, one: Any) -> list[str]:
     nested = getattr(one, "commands", {})
-    text = [f"## {name}\n", (one.help or "").replace("``", "`").replace("[", "\\[") + "\n"]
+    text = [f"## {name}\n", examples(one.help or "") + "\n"]
     rows = [
         [
             ", ".join(f"`{word}`" for word in each.opts + each.secondary_opts)
             if each.param_type_name == "option"
-            else f"`{each.human_readable_name}`",
+            else f"`{each.metavar or each.name.upper()}`",
             getattr(each, "help", None) or "",
             "" if each.default is None or callable(each.default) else value(each.default),
         ]
@@ -280,3 +286,11 @@ def _subcommand(name: str, one: Any) -> list[str]:
     for inner, each in nested.items():
         text += _subcommand(f"{name} {inner}", each)
     return text
+
+
+def examples(text: str) -> str:
+    """Help as Markdown: paragraphs that are a command line become code."""
+    paragraphs = [" ".join(one.split()) for one in text.replace("``", "`").split("\n\n")]
+    return "\n\n".join(
+        f"```bash\n{one}\n```" if one.startswith("coloc ") else one for one in paragraphs
+    )

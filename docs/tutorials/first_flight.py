@@ -2,7 +2,8 @@
 # # First flight
 #
 # Six UAVs circle in a room. Each has an IMU, sees landmarks near it, and measures its distance to
-# the others by UWB. At every step each says where it is; the reward is minus the error in metres.
+# the others by UWB. At every step each estimates where it is; the reward is minus the error in
+# metres.
 
 # %%
 import numpy as np
