@@ -133,6 +133,7 @@ class JointEkf(Localizer[GaussianBelief]):
                 self._information,
                 lambda at, delta: self.process.boxplus(at, delta.unflatten(-1, (n, e))),
                 self._apart,
+                self.process.dt,
             )
             rounds = round_robin(n, x.device)
             by_order, narrowed = ordered_update(x, p, model, trusts, rounds, n)

@@ -4,7 +4,7 @@ A range between two UAVs that are both metres off is linearized where neither of
 it claims to know is never taken back. So what does not involve others is used first, iterated to
 convergence; then each neighbour's in turn, linearized once where the last left the state. To
 iterate those as well would gain information on how the team as a whole is turned, which ranges do
-not have (Huang, Mourikis & Roumeliotis, IJRR 2010).
+not have (Huang, Mourikis & Roumeliotis, IJRR 2010). What linearizing neglects counts as noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,6 +19,7 @@ from agents.models.measurements import Block
 from agents.robust.screen import Trust
 
 _MOST = 10  # iterations of a UAV's own measurements
+_PERSISTENCE = 1.5  # s that the error of linearizing a range stays about the same
 _STILL = 1e-3  # m, m/s, rad: an iteration that moves nothing by more is the last
 
 
@@ -28,13 +29,14 @@ class Estimation:
 
     ``linearize(x)`` gives the blocks at a state, ``information(blocks, trusts)`` their Λ and η,
     ``boxplus(x, δ)`` the state after a correction, and ``apart(P, slots)`` the covariance
-    [B, N, d, d] of the UAVs' positions relative to those in the given slots.
+    [B, N, d, d] of the UAVs' positions relative to those in the given slots; ``dt`` is a step, s.
     """
 
     linearize: Callable[[Float[Tensor, "B N S"]], Sequence[Block]]
     information: Callable[[Sequence[Block], Sequence[Trust]], tuple[Tensor, Tensor]]
     boxplus: Callable[[Float[Tensor, "B N S"], Float[Tensor, "*s E"]], Float[Tensor, "B N S"]]
     apart: Callable[[Float[Tensor, "*s E E"], Int64[Tensor, "N"]], Float[Tensor, "B N d d"]]
+    dt: float
 
 
 def ordered_update(
@@ -47,7 +49,7 @@ def ordered_update(
 ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "*s E E"]]:
     """The posterior of ``x`` with covariance P, each measurement trusted as given; ``partners[r]``
     is the slot (of ``slots``) whose measurements each UAV uses in round r."""
-    first = model.linearize(x)
+    first, steps = model.linearize(x), max(1.0, _PERSISTENCE / model.dt)
     own = [i for i, block in enumerate(first) if block.partner is None]
     shared = [i for i, block in enumerate(first) if block.partner is not None]
 
@@ -57,7 +59,7 @@ def ordered_update(
 
     def partners_information(slot: Tensor, apart: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
         blocks = model.linearize(at)
-        chosen = [blocks[i].of(slot, slots).bent(apart) for i in shared]
+        chosen = [blocks[i].of(slot, slots).bent(apart, steps) for i in shared]
         return model.information(chosen, [trusts[i] for i in shared])
 
     if own:

@@ -87,7 +87,7 @@ def iterated_update(
             return p[..., :d, :d] + torch.diag_embed(neighbours.variance[:, everyone, slot])
 
         rounds = torch.arange(slots, device=x.device).unsqueeze(-1).expand(-1, x.shape[1])
-        model = Estimation(linearize, information, process.boxplus, apart)
+        model = Estimation(linearize, information, process.boxplus, apart, process.dt)
         by_order, narrowed = ordered_update(x, covariance, model, trusts, rounds, slots)
         state = torch.where(broad, by_order, state)
         updated = torch.where(broad.unsqueeze(-1), narrowed, updated)

@@ -47,7 +47,7 @@ class Rejuvenation:
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
         """Particles and unnormalized log-weights where evidence (``gain``) would leave ``few``: in
         the first steps used in stages with a resampling move after each; later, or where a screen
-        has made a density already, on redrawn particles. Who needs neither stays as it is."""
+        has made a density already, on redrawn particles. Other UAVs keep theirs."""
         late = few if self.screen.judges else few & (self.now.belief.step >= _START)
         early = few & ~late
         if bool(late.any()):

@@ -84,17 +84,18 @@ class Block:
         every = every.repeat(self.mask.shape[-1] // len(every))
         return replace(self, mask=self.mask & (every == slot.unsqueeze(-1)))
 
-    def bent(self, apart: Float[Tensor, "B N d d"]) -> "Block":
+    def bent(self, apart: Float[Tensor, "B N d d"], steps: float) -> "Block":
         """With what linearizing distances neglects as noise: their variance grows by
         ((tr M − uᵀ M u) / 2 d)², M being the covariance of the two UAVs' relative position, d their
-        distance and u its direction."""
+        distance and u its direction; by ``steps`` times that where so many steps share the error.
+        """
         if self.distance is None:
             return self
         assert self.partner is not None
         u, m = self.partner, apart[:, :, None, None]  # [B, N, m, 1, d] and [B, N, 1, 1, d, d]
         along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
         lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
-        return replace(self, variance=self.variance + (lateral / (2 * self.distance)) ** 2)
+        return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
 
 
 def usable(
