@@ -15,7 +15,13 @@ from torch import Tensor
 from agents.kalman.dead_reckoning import DeadReckoning
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import AnchorRanges, Block, make_measurements, model_of, nobody
+from agents.models.measurements import (
+    AnchorRanges,
+    Block,
+    make_measurements,
+    model_of,
+    no_neighbours,
+)
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
@@ -210,7 +216,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     ]:
         """Each step's own rows: ∂h/∂δ, residuals and variances; a row of zeros with variance 1
         where nothing was measured."""
-        alone = nobody(path[..., : self.process.dim])
+        alone = no_neighbours(path[..., : self.process.dim])
         rows = [self._rows(m.linearize(self.process, path, leaves, alone)) for m in self.models]
         jacobian, residual, variance = (torch.cat(parts, 3) for parts in zip(*rows, strict=True))
         return jacobian, residual, variance

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional
 
-from agents.models.measurements import AnchorRanges, nobody
+from agents.models.measurements import AnchorRanges, no_neighbours
 from agents.models.process import Process
 from agents.robust.mahalanobis import chi_square
 from agents.weights import Learned
@@ -36,7 +36,7 @@ def evidence(
     observation: Observation,
 ) -> Evidence:
     """The evidence about a state (its position alone, unless tags have lever arms)."""
-    alone = nobody(state[..., : process.dim])
+    alone = no_neighbours(state[..., : process.dim])
     if model.tags:
         block = model.linearize(process, state, observation, alone, derivatives=False)
         residual, mask = block.residual[..., 0] * block.mask, block.mask

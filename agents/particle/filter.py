@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import make_measurements, nobody, received
+from agents.models.measurements import make_measurements, no_neighbours, received
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
 from agents.particle.belief import ParticleBelief, Step, normal, own_keys
@@ -116,7 +116,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[ParticleBelief, Estimate]:
         key, neighbours = (
             noise.fold(belief.key, belief.step),
-            nobody(belief.last[..., : self.process.dim]),
+            no_neighbours(belief.last[..., : self.process.dim]),
         )
         if any(model.cooperative for model in self.models):
             neighbours = received(self.believed, observation)

@@ -91,11 +91,11 @@ class Correction(ActionMode):
         vectors = 3 * bool(self._fixes) + 2 * bool(self.models) + 1
         attitude = {"attitude": Leaf(self.process.attitude_size)} if self._fixes else {}
         return {
-            "base_estimate": Leaf(3 * d),
-            "base_std": Leaf(d, 0.0),
+            "base_estimate": Leaf(3 * d, unit="m, m/s, log m", frame="world"),
+            "base_std": Leaf(d, 0.0, unit="m", frame="world"),
             **attitude,
             **self._fixes,
-            "residuals": Leaf(vectors * d),
+            "residuals": Leaf(vectors * d, unit="m", frame="world"),
             "last_action": Leaf(d, -1.0, 1.0),
         }
 

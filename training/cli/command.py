@@ -64,7 +64,7 @@ for _command in (evaluate, scenarios, agents, render, bench, train, reproduce):
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"coloc {version('coloc')}")
+        typer.echo(f"coloc {version('coloc-env')}")
         raise typer.Exit
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, nobody, received
+from agents.models.measurements.base import Block, Measurement, Neighbours, no_neighbours, received
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
@@ -36,7 +36,7 @@ __all__ = [
     "make_measurements",
     "measures",
     "model_of",
-    "nobody",
+    "no_neighbours",
     "received",
 ]
 

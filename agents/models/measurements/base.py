@@ -29,7 +29,7 @@ class Neighbours:
     known: Bool[Tensor, "B N S"]
 
 
-def nobody(position: Float[Tensor, "*s d"]) -> Neighbours:
+def no_neighbours(position: Float[Tensor, "*s d"]) -> Neighbours:
     """No slots at all, for what a UAV at some position measures without others."""
     none = position.unsqueeze(-2)[..., :0, :]
     return Neighbours(none, none, none[..., 0] > 0)
