@@ -410,7 +410,7 @@ def test_watching_is_stepping_without_the_estimate(tools: SimpleNamespace) -> No
     ("options", "words"),
     [
         ("memory=1", "memory='1' is not allowed: a whole number from 2 to 1000"),
-        ("memory='0'", "memory='0'"),
+        ("memory=0", "memory='0'"),
         ("iterations=0", "iterations='0' is not allowed: a whole number ≥ 1"),
         ("memory=2.5", "memory='2.5' is not allowed: a whole number"),
         ("window=3", "unknown option 'window'.*memory"),
