@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, Neighbours, make_measurements
-from agents.models.ordered_update import Estimation, ordered_update
+from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import Prediction, RobustScreen, Trust
@@ -109,8 +109,7 @@ class JointEkf(Localizer[GaussianBelief]):
         evidence: Any = None
         trusts: list[Trust] = []
         broad = prior.broad(self.process.dim).any(-1, keepdim=True)
-        any_broad = bool(broad.any())
-        extra = self.screen.extra if any_broad else 0
+        extra = self.screen.extra if bool(broad.any()) else 0
         for iteration in range(-extra, self.iterations):
             blocks = self._blocks(state, observation)
             judged = blocks
@@ -127,18 +126,21 @@ class JointEkf(Localizer[GaussianBelief]):
             if iteration < 0:  # extra iterations are for broad priors alone
                 delta = torch.where(broad, delta, 0.0)
                 state = torch.where(broad.unsqueeze(-1), state, x)
-        if any_broad:
+        vague = prior.broad(self.process.dim, self.process.vague).any(-1, keepdim=True)
+        if bool(vague.any()):
+            own, shared = by_kind(self.models)
             model = Estimation(
-                lambda at: self._blocks(at, observation),
+                lambda at, cooperative: pick(
+                    self._blocks(at, observation), shared if cooperative else own
+                ),
                 self._information,
                 lambda at, delta: self.process.boxplus(at, delta.unflatten(-1, (n, e))),
                 self._apart,
                 self.process.dt,
             )
-            rounds = round_robin(n, x.device)
-            by_order, narrowed = ordered_update(x, p, model, trusts, rounds, n)
-            state = torch.where(broad.unsqueeze(-1), by_order, state)
-            updated = torch.where(broad.unsqueeze(-1), narrowed, updated)
+            found = ordered_update(x, p, model, pick(trusts, own), pick(trusts, shared))
+            state = torch.where(vague.unsqueeze(-1), found[0], state)
+            updated = torch.where(vague.unsqueeze(-1), found[1], updated)
         memory = self.screen.remember(prior, evidence, lambda: self._blocks(state, observation))
         return state, updated, memory
 
@@ -148,15 +150,12 @@ class JointEkf(Localizer[GaussianBelief]):
         split = p.unflatten(-1, (-1, e)).unflatten(1, (-1, e))
         return split.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
 
-    def _apart(
-        self, p: Float[Tensor, "B M M"], partner: Int64[Tensor, "N"]
-    ) -> Float[Tensor, "B N d d"]:
-        """Covariance of the UAVs' positions relative to their partners' (cross-covariances
-        included): M = P_ii + P_jj − P_ij − P_ji."""
-        n, d, i = len(partner), self.process.dim, torch.arange(len(partner), device=p.device)
-        blocks = p.unflatten(-1, (n, -1)).unflatten(1, (n, -1)).transpose(2, 3)[..., :d, :d]
-        own, cross = blocks[:, i, i], blocks[:, i, partner]
-        return own + own[:, partner] - cross - cross.mT
+    def _apart(self, p: Float[Tensor, "B M M"]) -> Float[Tensor, "B N N d d"]:
+        """Covariance of the UAVs' relative positions: M_ij = P_ii + P_jj − P_ij − P_ji."""
+        n, d = p.shape[-1] // self.process.error_size, self.process.dim
+        cross = p.unflatten(-1, (n, -1)).unflatten(1, (n, -1)).transpose(2, 3)[..., :d, :d]
+        own = cross.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+        return own.unsqueeze(2) + own.unsqueeze(1) - cross - cross.mT
 
     def _blocks(self, x: Float[Tensor, "B N S"], observation: Observation) -> list[Block]:
         neighbours = self._neighbours(x)
@@ -206,18 +205,6 @@ class JointEkf(Localizer[GaussianBelief]):
             residuals.append(trust.residual(block).flatten(1))
         h, wh = torch.cat(rows, 1), torch.cat(scaled, 1)
         return h.mT @ wh, (wh.mT @ torch.cat(residuals, 1).unsqueeze(-1))[..., 0]
-
-
-def round_robin(n: int, device: torch.device) -> Int64[Tensor, "rounds n"]:
-    """Who meets whom in each round of a tournament (circle method): every pair once, in as few
-    rounds as possible. Where n is odd, one UAV a round meets itself."""
-    even = n + n % 2
-    i, r = torch.arange(even - 1), torch.arange(even - 1).unsqueeze(-1)
-    partner = (r - i) % (even - 1)
-    partner = torch.where(partner == i, even - 1, partner)
-    last = (partner == even - 1).long().argmax(-1, keepdim=True)
-    partner = torch.cat((partner, last), -1)[:, :n]
-    return torch.where(partner < n, partner, torch.arange(n)).to(device)
 
 
 def _diagonal(blocks: Float[Tensor, "B N E E"]) -> Float[Tensor, "B N E N E"]:

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.models.measurements import Block, Neighbours
-from agents.models.ordered_update import Estimation, ordered_update
+from agents.models.measurements import Block, Measurement, Neighbours
+from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.robust.screen import Prediction, Screen, Trust
 
 
@@ -54,21 +54,20 @@ def iterated_update(
 ) -> Update:
     """Iterated (Gauss-Newton) EKF update of a prior, its measurements weighted by a screen.
 
-    Where the prior is broad, the screen's extra iterations come first, and what is trusted in the
-    end is then used again from the prior on, in order: see ``ordered_update``.
+    Where the prior is broad, the screen's extra iterations come first; where it is vague, what is
+    trusted in the end is used again from the prior on, in order: see ``ordered_update``.
     """
     process, x, covariance = screen.process, prior.state, prior.covariance
     state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
     evidence, trusts = None, []
     broad = prior.broad(process.dim).unsqueeze(-1)
-    any_broad = bool(broad.any())
-    extra = screen.extra if any_broad else 0
+    extra = screen.extra if bool(broad.any()) else 0
 
-    def linearize(at: Tensor) -> list[Block]:
-        return [m.linearize(process, at, prior.observation, neighbours) for m in screen.models]
+    def linearize(at: Tensor, models: Sequence[Measurement]) -> list[Block]:
+        return [m.linearize(process, at, prior.observation, neighbours) for m in models]
 
     for iteration in range(-extra, iterations):
-        blocks = linearize(state)
+        blocks = linearize(state, screen.models)
         if iteration == -extra:
             evidence = screen.judge(blocks, prior)
         trusts = screen.weigh(blocks, evidence, iteration == iterations - 1)
@@ -79,17 +78,20 @@ def iterated_update(
         state = process.boxplus(x, delta)
         if iteration < 0:  # extra iterations are for broad priors alone
             delta, state = torch.where(broad, delta, 0.0), torch.where(broad, state, x)
-    if any_broad:
-        slots, d = neighbours.known.shape[-1], process.dim
-        everyone = torch.arange(x.shape[1], device=x.device)
-
-        def apart(p: Tensor, slot: Tensor) -> Tensor:
-            return p[..., :d, :d] + torch.diag_embed(neighbours.variance[:, everyone, slot])
-
-        rounds = torch.arange(slots, device=x.device).unsqueeze(-1).expand(-1, x.shape[1])
-        model = Estimation(linearize, information, process.boxplus, apart, process.dt)
-        by_order, narrowed = ordered_update(x, covariance, model, trusts, rounds, slots)
-        state = torch.where(broad, by_order, state)
-        updated = torch.where(broad.unsqueeze(-1), narrowed, updated)
-    memory = screen.remember(prior, evidence, lambda: linearize(state))
+    vague = prior.broad(process.dim, process.vague).unsqueeze(-1)
+    if bool(vague.any()):
+        d, theirs = process.dim, torch.diag_embed(neighbours.variance)
+        own, shared = by_kind(screen.models)
+        kinds = pick(screen.models, own), pick(screen.models, shared)
+        model = Estimation(
+            lambda at, cooperative: linearize(at, kinds[cooperative]),
+            information,
+            process.boxplus,
+            lambda p: p[..., None, :d, :d] + theirs,
+            process.dt,
+        )
+        found = ordered_update(x, covariance, model, pick(trusts, own), pick(trusts, shared))
+        state = torch.where(vague, found[0], state)
+        updated = torch.where(vague.unsqueeze(-1), found[1], updated)
+    memory = screen.remember(prior, evidence, lambda: linearize(state, screen.models))
     return Update(state, updated, trusts, memory)

@@ -47,10 +47,10 @@ class Prediction:
     observation: Observation
     memory: Float[Tensor, "B N K"]
 
-    def broad(self, dim: int) -> Bool[Tensor, "B N"]:
-        """Whether the position is hardly known."""
+    def broad(self, dim: int, std: float = _BROAD) -> Bool[Tensor, "B N"]:
+        """Whether the position is hardly known: by more than ``std`` (m) an axis."""
         variance = self.covariance[..., :dim, :dim].diagonal(dim1=-2, dim2=-1).sum(-1)
-        return variance > dim * _BROAD**2
+        return variance > dim * std**2
 
 
 class Screen(ABC):

@@ -7,8 +7,7 @@ UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
-import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from agents.models.process import Process
@@ -78,21 +77,18 @@ class Block:
             return self.variance
         return self.variance + self.partner_variance
 
-    def of(self, slot: Int64[Tensor, "N"], slots: int) -> "Block":
-        """Only the measurements that involve the UAV in the slot (of ``slots``) given for each."""
-        every = torch.arange(slots, device=slot.device).repeat_interleave(self.per_slot)
-        every = every.repeat(self.mask.shape[-1] // len(every))
-        return replace(self, mask=self.mask & (every == slot.unsqueeze(-1)))
-
-    def bent(self, apart: Float[Tensor, "B N d d"], steps: float) -> "Block":
+    def bent(self, apart: Float[Tensor, "B N S d d"], steps: float) -> "Block":
         """With what linearizing distances neglects as noise: their variance grows by
-        ((tr M − uᵀ M u) / 2 d)², M being the covariance of the two UAVs' relative position, d their
-        distance and u its direction; by ``steps`` times that where so many steps share the error.
+        ((tr M − uᵀ M u) / 2 d)², M being the covariance of the two UAVs' relative position (by
+        slot), d their distance and u its direction; by ``steps`` times that where so many steps
+        share the error.
         """
         if self.distance is None:
             return self
         assert self.partner is not None
-        u, m = self.partner, apart[:, :, None, None]  # [B, N, m, 1, d] and [B, N, 1, 1, d, d]
+        m = apart.repeat_interleave(self.per_slot, 2)
+        m = m.repeat(1, 1, self.mask.shape[-1] // m.shape[2], 1, 1).unsqueeze(3)
+        u = self.partner  # [B, N, m, 1, d]
         along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
         lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)

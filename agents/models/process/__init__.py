@@ -5,6 +5,8 @@ tangent space (attitude perturbed on the right, in the body frame), of size ``er
 is always ``x[..., :d]``, velocity ``x[..., d:2d]`` and the position's error ``δ[..., :d]``.
 """
 
+import math
+
 from agents.models.process.base import Process
 from agents.models.process.constant_velocity import ConstantVelocityProcess
 from agents.models.process.inertial import InertialProcess
@@ -24,6 +26,7 @@ __all__ = [
 ]
 
 
+_VAGUE = 0.01  # of the arena's diagonal
 _INPUTS: dict[type, type[Sensor]] = {  # what drives a motion model
     believed_processes.Inertial: Imu,
     believed_processes.InsDriven: Ins,
@@ -38,6 +41,12 @@ def drives(believed: Believed, sensor: Sensor) -> bool:
 
 def make_process(believed: Believed) -> Process:
     """The motion model that a team believes in; ValueError if a sensor it needs is missing."""
+    process = _process(believed)
+    process.vague = max(process.vague, _VAGUE * math.dist(believed.arena.low, believed.arena.high))
+    return process
+
+
+def _process(believed: Believed) -> Process:
     settings, arena = believed.process, believed.arena
     if isinstance(settings, believed_processes.ConstantVelocity):
         return ConstantVelocityProcess(arena.dim, arena.dt, settings)

@@ -15,13 +15,16 @@ _LEAST_STD = 1e-6  # m, m/s, rad: of a prior, whose covariance must have an inve
 
 
 class Process(ABC):
-    """A motion model. ``attitude_error`` is the attitude's slice of the error, if it is a state."""
+    """A motion model. ``attitude_error`` is the attitude's slice of the error, if it is a state;
+    ``vague`` (m per axis) the position's standard deviation beyond which measurements are not
+    linearized all at once."""
 
     state_size: int
     error_size: int
     noise_size: int
     attitude_size: int = 0
     attitude_error: slice | None = None
+    vague: float = 0.5
 
     def __init__(self, dim: int, dt: float) -> None:
         self.dim, self.dt = dim, dt
