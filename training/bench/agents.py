@@ -10,6 +10,7 @@ from agents import LOCALIZERS, make
 from agents.factor_graph.pose_graph import PoseGraph
 from agents.particle.hybrid import HybridFilter
 from agents.stdcl.loop import NetworkLoop
+from agents.stein.stein_vi import SteinViFilter
 from agents.stein.team import RelativeTeam
 from agents.swarm.filter import SwarmFilter
 from coloc_env.scenarios import make_scenario
@@ -86,4 +87,7 @@ def _at_home(name: str) -> Iterator[Task]:
             yield Task("relative", f"{agent}, {words}", agent, scenario)
     else:
         anchors = 4 if issubclass(kind, HybridFilter) else 0  # it refuses a team without
-        yield Task("agents", name, name, "indoor-v0", (("anchors", anchors),))
+        overrides: tuple[tuple[str, Any], ...] = (("anchors", anchors),)
+        if issubclass(kind, SteinViFilter):  # it refuses a team with ranges
+            overrides = (*overrides, ("uwb", False))
+        yield Task("agents", name, name, "indoor-v0", overrides)

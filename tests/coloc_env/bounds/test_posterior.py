@@ -16,7 +16,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.bounds import Bound, posterior_bound, range_information, worlds
 from coloc_env.bounds.expected import expected_information
-from coloc_env.bounds.information import SHARED, own_information, shared_information
+from coloc_env.bounds.information import own_information, shared_information
 from coloc_env.bounds.mixture import error_density
 from coloc_env.bounds.process import error_model, prior_covariance, strapdown_jacobians
 from coloc_env.geometry import (
@@ -360,7 +360,7 @@ def test_information_is_that_of_the_log_likelihood(case: tuple[Sensor, int, Call
     jacobian = jacobian.reshape(-1, N * d)
     assert (weights > 0).any()
     wanted = (jacobian.mT @ (weights.unsqueeze(-1) * jacobian)).unflatten(1, (N, d))
-    if isinstance(sensor, SHARED):
+    if sensor.between_uavs:
         found = shared_information(sensor, truth, seen)[0].flatten(0, 1)
     else:
         own = own_information(sensor, truth, seen)[0]

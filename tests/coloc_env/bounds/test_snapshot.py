@@ -320,7 +320,7 @@ def efficiency(task: Scenario, runs: int, fit: Any) -> float:
     for true, measured in zip(place, ranges, strict=True):
 
         def residual(x: NDArray[np.float64], true: Any = true, measured: Any = measured) -> Any:
-            p = np.concatenate((true[:guides], x.reshape(-1, 3)))
+            p = np.concatenate((true[:anchors], x.reshape(-1, 3)))
             return np.linalg.norm(p[i] - p[j], axis=-1) - measured[i, j]
 
         def jacobian(x: NDArray[np.float64], true: Any = true) -> Any:

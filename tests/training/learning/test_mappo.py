@@ -437,7 +437,6 @@ def test_only_mappos_critic_sees_the_team() -> None:
         ({"variants": "n_uavs=2/n_uavs=3"}, "variants='n_uavs=2/n_uavs=3' must have one horizon"),
         ({"variants": "horizon=10/horizon=30"}, "must have one horizon, one number of UAVs, and"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
-        ({"base": "mappo:weights=none"}, "base='mappo:weights=none' is not allowed: a filter"),
         ({"feedback": 2.0}, "feedback=2.0 is not allowed: a number from 0 to 1"),
         ({"recurrent": "yes"}, "recurrent='yes' is not allowed: true or false is needed"),
         ({"scenario": "indor-v0"}, "unknown scenario 'indor-v0' (did you mean 'indoor-v0'?)"),

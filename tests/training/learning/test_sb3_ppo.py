@@ -206,7 +206,6 @@ def test_card_and_scores(tmp_path: Path) -> None:
         ({"clip": 0.0}, "sb3-ppo: clip=0.0 is not allowed: a number > 0"),
         ({"gamma": 1.1}, "sb3-ppo: gamma=1.1 is not allowed: a number from 0 to 1"),
         ({"base": "efk"}, "unknown agent 'efk' (did you mean 'ekf'?)"),
-        ({"base": "sb3-ppo:weights=none"}, "base='sb3-ppo:weights=none' is not allowed: a filter"),
         ({"feedback": -1.0}, "feedback=-1.0 is not allowed: a number from 0 to 1"),
         ({"variants": "nlos=0.3"}, "sb3-ppo: unknown option 'variants'"),
         ({"recurrent": True}, "sb3-ppo: unknown option 'recurrent'"),
