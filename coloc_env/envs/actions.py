@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
+from coloc_env.commands import Commands
 from coloc_env.observation import Observation, action_bounds, all_leaves, state_bounds
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
-from coloc_env.world import World
+from coloc_env.world import Step, World
 
 Leaves = dict[str, Float32[Tensor, "B N F"]]
 MAX_STATE_ERROR = 100.0  # m: larger errors are cut in the privileged state, whose bounds are finite
@@ -29,16 +30,25 @@ class ActionMode(ABC):
     A memory is a tensorclass of batch (B, N) that holds all there is from step to step (None if
     there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
     what the mode adds to each UAV's observation, ``features`` those that a policy should read,
-    ``meaning`` the words for an action in error messages.
+    ``meaning`` the words for an action in error messages. ``choices``: actions are one of so many
+    (None: numbers within ``bounds``). ``whole``: its leaf ``observation`` is all that agents see, a
+    flat vector within its bounds, with their ``action_mask`` where actions are choices.
     """
 
     name: ClassVar[str]
+    choices: int | None = None
+    whole: bool = False
     meaning: ClassVar[str]
     features: tuple[str, ...] = ()
 
     def __init__(self, believed: Believed) -> None:
         self.believed = believed
         self.dim = believed.arena.dim
+
+    @property
+    def n_agents(self) -> int:
+        """The first so many UAVs act; the others are part of the world."""
+        return self.believed.arena.n_uavs
 
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
@@ -48,7 +58,7 @@ class ActionMode(ABC):
     @property
     def width(self) -> int:
         """How many numbers one UAV's action has."""
-        return len(self.bounds[0])
+        return 1 if self.choices else len(self.bounds[0])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -75,25 +85,50 @@ class ActionMode(ABC):
         """The memory after an action, and the estimate that it stands for: position (m), velocity
         (m/s) and log standard deviation of the position (m), each per axis of the world frame."""
 
+    def commands(self, memory: Any, action: Float32[Tensor, "B n a"]) -> Commands:
+        """What an action commands the world to do in the step to come."""
+        return Commands()
+
+    def reward(
+        self, memory: Any, world: World, error: Float32[Tensor, "B N"]
+    ) -> tuple[Any, Float32[Tensor, "B n"]] | None:
+        """The memory and the reward of the step that ends now; ``error`` (m) is that of the
+        estimates scored last (None: the reward is the scenario's own)."""
+        return None
+
     def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
         """The position (m) that actions are relative to; None where they are not."""
         return None
 
 
 class Estimates(ActionMode):
-    """The estimate itself, as localizers give it. (Values beyond ``bounds`` are scored as well.)"""
+    """The estimate itself, as localizers give it (values beyond ``bounds`` are scored as well).
+
+    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame).
+    """
 
     name = "estimate"
     meaning = "[position, velocity, log-std]"
 
+    def __init__(self, believed: Believed) -> None:
+        super().__init__(believed)
+        self.largest = believed.largest_command
+        if self.largest:
+            self.meaning = "[position, velocity, log-std, command]"
+
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
-        return action_bounds(self.believed.arena)
+        low, high = action_bounds(self.believed.arena)
+        more = [self.largest] * self.dim if self.largest else []
+        return low + [-x for x in more], high + more
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
     ) -> tuple[None, Float32[Tensor, "B N A"]]:
-        return None, action
+        return None, action[..., : 3 * self.dim]
+
+    def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
+        return Commands(action[..., 3 * self.dim :] if self.largest else None)
 
 
 class ModeRunner:
@@ -137,10 +172,20 @@ class ModeRunner:
     def _copies(self) -> Leaves:
         return {name: leaf.clone() for name, leaf in self._leaves.items()}
 
-    def estimate(self, action: Float32[Tensor, "B N a"]) -> Float32[Tensor, "B N A"]:
-        """The estimates that actions stand for."""
+    def estimate(self, action: Float32[Tensor, "B n a"]) -> Float32[Tensor, "B N A"]:
+        """The estimates that actions stand for; what they command waits for ``step``."""
         self._memory, estimates = self.mode.estimate(self._memory, action)
+        self._commands = self.mode.commands(self._memory, action)
         return estimates
+
+    def step(self, estimates: Float32[Tensor, "B N A"]) -> Step:
+        """Move the worlds on, estimates scored and commands obeyed; rewards are the mode's."""
+        step = self.world.step(estimates, self._commands)
+        rewarded = self.mode.reward(self._memory, self.world, step.error)
+        if rewarded is None:
+            return step
+        self._memory, reward = rewarded
+        return step._replace(reward=reward)
 
     def state(self) -> Float32[Tensor, "B S"]:
         """What a critic may know: the truth, and the error in m of what actions are relative to,
@@ -172,7 +217,7 @@ def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
 
 def observed_leaves(scenario: Scenario, mode: ActionMode) -> dict[str, Leaf]:
     """Every leaf of an observation in this mode, in the order of the spaces."""
-    return all_leaves(scenario) | mode.leaves
+    return mode.leaves if mode.whole else all_leaves(scenario) | mode.leaves
 
 
 def chosen_leaves(
@@ -182,7 +227,7 @@ def chosen_leaves(
     all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
     not end together."""
     known = observed_leaves(scenario, mode)
-    names = tuple(wanted or mode.features or known)
+    names = tuple(wanted or (("observation",) if mode.whole else mode.features or known))
     for name in names:
         if name not in known:
             raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")

@@ -135,7 +135,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         scored = self._of(self._window.scored[world.cursor])
-        step = world.step(estimates)
+        step = self._runner.step(estimates)
         observations = self._observe(self._runner.observe())
         errors, rewards = self._of(step.error.tolist()[0]), self._of(step.reward.tolist()[0])
         infos = {a: self._tallies[a].add(errors[a], scored[a]) for a in acting}

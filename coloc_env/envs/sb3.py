@@ -131,7 +131,7 @@ class CoLocVecEnv(VecEnv):
         estimates = self.runner.estimate(self._actions)
         if self._renderer is not None:
             self._renderer.record(self.world, estimates[:1])
-        step = self.world.step(estimates)
+        step = self.runner.step(estimates)
         observation = self._flat(self.runner.observe())
         infos: list[dict[str, Any]] = [{} for _ in self.sub_envs]
         over = bool(step.truncated[0])  # worlds start and end together

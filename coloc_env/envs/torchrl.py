@@ -119,7 +119,7 @@ class CoLocEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]
         action = checked_tensor(self.scenario, self.mode, action, self.batch_size[0])
-        step = self.world.step(self._runner.estimate(action))
+        step = self._runner.step(self._runner.estimate(action))
         out = self._observe(self._runner.observe())
         out["uav"].set("reward", step.reward.unsqueeze(-1))
         return out

@@ -8,15 +8,15 @@ from agents.models.measurements.base import Block, Measurement, Neighbours
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
-from coloc_env.sensors import AnchorRanging, Ranging
+from coloc_env.sensors import AnchorRanging, RangeNoise, Ranging
 from coloc_env.sensors.ranging import Tags
 
 
 class _Ranges(Measurement):
     """Distances from the UAV's own tags to points; shared by anchors and neighbours."""
 
-    def __init__(self, std: float, tags: Tags) -> None:
-        self.variance = std**2
+    def __init__(self, noise: RangeNoise, tags: Tags) -> None:
+        self.noise, self.variance = noise, noise.std**2
         self.tags = tags
 
     def _arms(self, x: Float[Tensor, "B N S"]) -> Float[Tensor, "B N T d"]:
@@ -45,6 +45,13 @@ class _Ranges(Measurement):
             derivative = torch.stack((-turned[..., 1:], turned[..., :1]), -2)
         return position + turned, derivative, 0.0
 
+    def _variance(self, distance: Float[Tensor, "B N T P"]) -> Float[Tensor, "B N T*P 1"]:
+        """R of each range, at the distance that is expected."""
+        flat = distance.flatten(-2).unsqueeze(-1)
+        if not self.noise.per_metre:
+            return flat.new_tensor(self.variance).expand_as(flat)
+        return (self.noise.std + self.noise.per_metre * flat) ** 2
+
     def _block(
         self,
         process: Process,
@@ -70,7 +77,7 @@ class _Ranges(Measurement):
         block = Block(
             residual=residual,
             jacobian=jacobian,
-            variance=x.new_tensor(self.variance + spread).expand_as(residual),
+            variance=self._variance(distance) + spread if spread else self._variance(distance),
             mask=mask.flatten(-2),
         )
         return block, unit
@@ -89,7 +96,7 @@ class AnchorRanges(_Ranges):
         return observation["anchor_ranges"], observation["anchor_map"].unflatten(-1, (-1, d))
 
     def __init__(self, sensor: AnchorRanging) -> None:
-        super().__init__(sensor.noise.std, sensor.tags)
+        super().__init__(sensor.noise, sensor.tags)
         self.n_tags = sensor.n_tags
 
     def linearize(
@@ -123,7 +130,7 @@ class UavRanges(_Ranges):
         return observation["ranges"], neighbours.position
 
     def __init__(self, sensor: Ranging) -> None:
-        super().__init__(sensor.noise.std, sensor.tags)
+        super().__init__(sensor.noise, sensor.tags)
         self.n_tags, self.latency = sensor.n_tags, sensor.latency
         arms = torch.tensor(sensor.tags, dtype=torch.float64) if sensor.tags else None
         self.their_arms = 0.0 if arms is None else float((arms**2).sum(-1).mean()) / arms.shape[-1]
