@@ -25,6 +25,7 @@ class Prior:
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
     world; with ``kind="uniform"`` nothing of the position but that it lies in the arena, and with
     ``max_speed`` (m/s) nothing of the velocity but that each component lies within ± that.
+    ``target_std``: of the positions of targets, in m (None: as of UAVs).
     """
 
     position_std: float = 2.0
@@ -32,6 +33,7 @@ class Prior:
     attitude_std: float = 0.05
     kind: PriorKind = "gaussian"
     max_speed: float | None = None
+    target_std: float | None = None
 
     def __post_init__(self) -> None:
         kinds = get_args(PriorKind)

@@ -243,8 +243,10 @@ def draw_prior(
         position = (0.5 * (low + high)).expand_as(truth.position)
         position_std = ((high - low) / 12**0.5).expand_as(truth.position)
     else:
-        position = truth.position + prior.position_std * draws[..., :dim]
-        position_std = torch.full_like(position, prior.position_std)
+        position_std = torch.full_like(truth.position, prior.position_std)
+        if scenario.targets and prior.target_std is not None:
+            position_std[:, n - scenario.targets :] = prior.target_std
+        position = truth.position + position_std * draws[..., :dim]
     velocity = truth.velocity + prior.velocity_std * draws[..., dim : 2 * dim]
     if prior.max_speed is not None:
         velocity = torch.zeros_like(velocity)

@@ -15,6 +15,7 @@ from torch import Tensor
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import Prediction, RobustScreen, Trust
@@ -24,6 +25,10 @@ from coloc_env.scenario import Believed
 
 class JointEkf(Localizer[GaussianBelief]):
     """Centralized EKF of the team's joint state; options as ``ekf`` has them.
+
+    ``second_order``: ranges are expanded to the second order, so that what is uncertain across a
+    line of sight makes its range longer and less certain (Jazwinski 1970, section 9.3; without
+    tags' lever arms only).
 
     Its belief's covariance is [B, N, E, N · E]: each UAV's rows of the joint matrix.
     """
@@ -39,6 +44,7 @@ class JointEkf(Localizer[GaussianBelief]):
         gate: float = 0.999,
         iterations: int = 2,
         cooperate: bool = True,
+        second_order: bool = False,
     ) -> None:
         super().__init__(believed)
         if believed.slots < believed.arena.n_uavs:
@@ -51,6 +57,7 @@ class JointEkf(Localizer[GaussianBelief]):
         self.process, self.iterations = make_process(believed), iterations
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen = RobustScreen(self.process, self.models, robust, gate)
+        self.second_order = second_order
 
     @property
     def exchanges(self) -> bool:
@@ -110,6 +117,8 @@ class JointEkf(Localizer[GaussianBelief]):
             extra = self.screen.extra if bool(broad.any()) else 0
         for iteration in range(-extra, self.iterations):
             blocks = self._blocks(state, observation)
+            if self.second_order:
+                blocks = self._expanded(blocks, p, observation)
             judged = blocks
             if self.screen.judges:
                 judged = [self._doubtful(block, updated) for block in blocks]
@@ -136,6 +145,33 @@ class JointEkf(Localizer[GaussianBelief]):
     def _blocks(self, x: Float[Tensor, "B N S"], observation: Observation) -> list[Block]:
         neighbours = self._neighbours(x)
         return [m.linearize(self.process, x, observation, neighbours) for m in self.models]
+
+    def _expanded(
+        self, blocks: Sequence[Block], p: Float[Tensor, "B M M"], observation: Observation
+    ) -> list[Block]:
+        """The blocks with ranges' second-order terms: E r ≈ r̂ + ½ σ_⊥² / r̂, whose variance is
+        ½ (σ_⊥² / r̂)²; σ_⊥² is the relative variance across the line."""
+        d, e = self.process.dim, self.process.error_size
+        joint = p.unflatten(-1, (-1, e)).unflatten(1, (-1, e))[:, :, :d, :, :d]
+        joint = joint.transpose(2, 3)  # [B, N, N, d, d]
+        own = joint.diagonal(dim1=1, dim2=2).movedim(-1, 1)  # [B, N, d, d]
+        found = []
+        for model, block in zip(self.models, blocks, strict=True):
+            if not isinstance(model, UavRanges | AnchorRanges) or model.tags:
+                found.append(block)
+                continue
+            relative = own.unsqueeze(2)
+            if model.cooperative:
+                relative = relative + own.unsqueeze(1) - joint - joint.transpose(1, 2)
+            unit = block.jacobian[..., 0, :d]  # [B, N, m, d]
+            along = ((relative @ unit.unsqueeze(-1))[..., 0] * unit).sum(-1)
+            across = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+            measured = observation[model.leaf].to(across.dtype)
+            distance = (measured - block.residual[..., 0]).clamp_min(1e-3)
+            longer = (0.5 * across.clamp_min(0.0) / distance).unsqueeze(-1)
+            residual, variance = block.residual - longer, block.variance + 2 * longer**2
+            found.append(replace(block, residual=residual, variance=variance))
+        return found
 
     def _doubtful(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
         """The block as one UAV alone would judge it: with what its partners do not know of

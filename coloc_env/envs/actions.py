@@ -9,13 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from coloc_env.commands import Commands
-from coloc_env.observation import Observation, action_bounds, all_leaves, state_bounds
+from coloc_env.observation import Observation, action_bounds, all_leaves, box, state_bounds
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
 from coloc_env.world import Step, World
@@ -33,12 +34,14 @@ class ActionMode(ABC):
     ``meaning`` the words for an action in error messages. ``choices``: actions are one of so many
     (None: numbers within ``bounds``). ``whole``: its leaf ``observation`` is all that agents see, a
     flat vector within its bounds, with their ``action_mask`` where actions are choices.
+    ``rewards``: rewards are its own, of what is estimated after the step.
     """
 
     name: ClassVar[str]
     choices: int | None = None
     whole: bool = False
-    meaning: ClassVar[str]
+    meaning: str
+    rewards: bool = False
     features: tuple[str, ...] = ()
 
     def __init__(self, believed: Believed) -> None:
@@ -59,6 +62,11 @@ class ActionMode(ABC):
     def width(self) -> int:
         """How many numbers one UAV's action has."""
         return 1 if self.choices else len(self.bounds[0])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one UAV's action."""
+        return () if self.choices else (self.width,)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -89,12 +97,10 @@ class ActionMode(ABC):
         """What an action commands the world to do in the step to come."""
         return Commands()
 
-    def reward(
-        self, memory: Any, world: World, error: Float32[Tensor, "B N"]
-    ) -> tuple[Any, Float32[Tensor, "B n"]] | None:
-        """The memory and the reward of the step that ends now; ``error`` (m) is that of the
-        estimates scored last (None: the reward is the scenario's own)."""
-        return None
+    def reward(self, memory: Any, world: World) -> tuple[Any, Float32[Tensor, "B n"]]:
+        """The reward of the step that led here, given the memory with this step's observation, and
+        the memory with what rewards are counted by."""
+        raise NotImplementedError
 
     def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
         """The position (m) that actions are relative to; None where they are not."""
@@ -141,7 +147,8 @@ class ModeRunner:
         self.mode, self.world = mode, world
         self.width = mode.width
         self._adds_nothing = not mode.leaves and type(mode).reset is ActionMode.reset
-        self._started = False
+        self._started = self._ahead = False
+        self._commands = Commands()
         self._memory: Any = None
         self._leaves: Leaves = {}
 
@@ -156,17 +163,20 @@ class ModeRunner:
             chosen = rows[:, None].expand(observation.batch_size)
             fresh = None if fresh is None else fresh.where(chosen, self._memory)
             leaves = {
-                name: torch.where(chosen.unsqueeze(-1), leaf, self._leaves[name])
+                name: torch.where(rows[:, None, None], leaf, self._leaves[name])
                 for name, leaf in leaves.items()
             }
-        self._memory, self._leaves, self._started = fresh, leaves, True
+        self._memory, self._leaves, self._started, self._ahead = fresh, leaves, True, False
         return self._copies()
 
     def observe(self) -> Leaves:
         """The leaves at the step that the worlds have moved to."""
         if self._adds_nothing:
             return {}
-        self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
+        if self._ahead:
+            self._ahead = False
+        else:
+            self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
         return self._copies()
 
     def _copies(self) -> Leaves:
@@ -181,11 +191,17 @@ class ModeRunner:
     def step(self, estimates: Float32[Tensor, "B N A"]) -> Step:
         """Move the worlds on, estimates scored and commands obeyed; rewards are the mode's."""
         step = self.world.step(estimates, self._commands)
-        rewarded = self.mode.reward(self._memory, self.world, step.error)
-        if rewarded is None:
+        if not self.mode.rewards:
             return step
-        self._memory, reward = rewarded
+        self.observe()
+        self._ahead = True
+        self._memory, reward = self.mode.reward(self._memory, self.world)
         return step._replace(reward=reward)
+
+    @property
+    def memory(self) -> Any:
+        """The mode's memory at the step last observed."""
+        return self._memory
 
     def state(self) -> Float32[Tensor, "B S"]:
         """What a critic may know: the truth, and the error in m of what actions are relative to,
@@ -195,6 +211,13 @@ class ModeRunner:
             return truth
         error = (reference - self.world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
         return torch.cat((truth, error.flatten(-2)), -1)
+
+
+def action_space(mode: ActionMode) -> gym.spaces.Space[Any]:
+    """One UAV's actions."""
+    if mode.choices is not None:
+        return gym.spaces.Discrete(mode.choices)
+    return box(mode.bounds)
 
 
 def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
@@ -253,7 +276,9 @@ def checked_tensor(
 ) -> Float32[Tensor, "B N a"]:
     """Actions of several worlds as float32. ValueError, in one line that names UAV, world and what
     is needed, for another shape, complex numbers, and NaN or infinity."""
-    shape = (worlds, scenario.arena.n_uavs, mode.width)
+    shape: tuple[int, ...] = (worlds, mode.n_agents)
+    if mode.choices is None:
+        shape = (*shape, mode.width)
     if tuple(actions.shape) != shape:
         raise ValueError(
             f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
@@ -264,11 +289,19 @@ def checked_tensor(
     actions = actions.to(torch.float32)
     finite = actions.isfinite()
     if not bool(finite.all()):
-        row, uav, _ = (~finite).nonzero()[0].tolist()
+        row, uav = (~finite).nonzero()[0, :2].tolist()
         raise ValueError(
             f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; "
             f"{_needed(mode)}"
         )
+    if mode.choices is not None:
+        known = (actions >= 0) & (actions < mode.choices) & (actions == actions.round())
+        if not bool(known.all()):
+            row, uav = (~known).nonzero()[0].tolist()
+            raise ValueError(
+                f"{scenario.name}: the action of uav_{uav} in world {row} is none of the choices; "
+                f"{_needed(mode)}"
+            )
     return actions
 
 
@@ -278,9 +311,9 @@ def checked_arrays(
     """The agents' actions, one a row. ValueError, in one line that names the agent and what is
     needed, for one that is not numeric, complex, of another shape, or holds NaN or infinity."""
     rows = _array([actions[agent] for agent in agents])
-    if rows is not None and rows.shape == (len(agents), mode.width):
+    if rows is not None and rows.shape == (len(agents), *mode.shape):
         values = rows.astype(np.float32)
-        if np.count_nonzero(np.isfinite(values)) == values.size:
+        if np.count_nonzero(np.isfinite(values)) == values.size and _chosen(mode, values):
             return values
     return np.stack([_checked_array(scenario, mode, actions[agent], agent) for agent in agents])
 
@@ -291,13 +324,22 @@ def _checked_array(
     values = _array(action)
     if values is None:
         wrong = "is not made of real numbers"
-    elif values.shape != (mode.width,):
+    elif values.shape != mode.shape:
         wrong = f"has shape {values.shape}"
     elif not np.isfinite(values.astype(np.float32)).all():
         wrong = "holds NaN or infinity"
+    elif not _chosen(mode, values):
+        wrong = f"is {values}, none of the choices"
     else:
         return values.astype(np.float32)
     raise ValueError(f"{scenario.name}: the action of {agent} {wrong}; {_needed(mode)}")
+
+
+def _chosen(mode: ActionMode, values: np.ndarray) -> bool:
+    """Whether actions are among the choices, where there are choices."""
+    if mode.choices is None:
+        return True
+    return bool(((values >= 0) & (values < mode.choices) & (values == np.round(values))).all())
 
 
 def _array(numbers: Any) -> np.ndarray | None:
@@ -310,4 +352,7 @@ def _array(numbers: Any) -> np.ndarray | None:
 
 
 def _needed(mode: ActionMode) -> str:
+    if mode.choices is not None:
+        last = mode.choices - 1
+        return f"0 to {last} is needed with action={mode.name}: {mode.meaning}"
     return f"({mode.width},) finite numbers are needed with action={mode.name}: {mode.meaning}"

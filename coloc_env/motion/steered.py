@@ -80,7 +80,7 @@ class Steered(Motion):
             ahead = torch.where(moves & moving, turned, ahead)
             path.append((position, velocity, ahead))
         places, speeds, noses = (torch.stack(each, 1) for each in zip(*path, strict=True))
-        attitude = yaw_attitude(*noses.unbind(-1), arena.dim)
+        attitude = yaw_attitude(noses[..., 0], noses[..., 1], arena.dim)
         state = {"position": position, "velocity": velocity, "ahead": ahead}
         return Kinematics(places, speeds, attitude), {**state, "command": carry["command"]}
 

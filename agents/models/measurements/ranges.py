@@ -86,7 +86,7 @@ class _Ranges(Measurement):
 class AnchorRanges(_Ranges):
     """Distances to anchors at known positions."""
 
-    mask_leaf = "anchor_range_mask"
+    mask_leaf, leaf = "anchor_range_mask", "anchor_ranges"
 
     def ends(
         self, observation: Observation, neighbours: Neighbours
@@ -121,7 +121,7 @@ class UavRanges(_Ranges):
     """
 
     cooperative = True
-    mask_leaf = "range_mask"
+    mask_leaf, leaf = "range_mask", "ranges"
 
     def ends(
         self, observation: Observation, neighbours: Neighbours
