@@ -172,7 +172,7 @@ class Scenario:
     ``anchor_uavs``: the first so many UAVs know where they are and are not scored. ``reference``:
     what is to be reported beside the truth as if it were the truth (None: nothing). ``targets``:
     the last so many UAVs are passive: others range to them, they range neither anchors nor each
-    other.
+    other. ``strangers``: the first so many UAVs do not range each other.
     """
 
     name: str
@@ -191,6 +191,7 @@ class Scenario:
     anchor_uavs: int = 0
     reference: SatelliteReference | None = None
     targets: int = 0
+    strangers: int = 0
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

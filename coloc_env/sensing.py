@@ -157,9 +157,10 @@ def sense(
     alive = steps.unsqueeze(-1) < fails_at
     neighbours, reach = network.neighbours(motion.position, alive)
     reach = network.unbroken(step_keys, neighbours, reach, motion.position)
-    if scenario.targets:
-        idle = torch.arange(arena.n_uavs, device=keys.device) >= arena.n_uavs - scenario.targets
-        reach = reach & ~(idle[:, None] & idle[neighbours])
+    index = torch.arange(arena.n_uavs, device=keys.device)
+    for apart in (index >= arena.n_uavs - scenario.targets, index < scenario.strangers):
+        if scenario.targets or scenario.strangers:
+            reach = reach & ~(apart.unsqueeze(-1) & apart[neighbours])
     to_anchors = None
     if calls is not None:
         near = network.interference or network.radius or float("inf")

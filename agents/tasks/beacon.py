@@ -27,7 +27,7 @@ from coloc_env.scenario import Prior
 from coloc_env.world import World
 
 _SIDE, _RADIUS, _ANCHOR_RADIUS = 120.0, 50.0, 20.0
-_ANCHORS = ((40.0, 60.0), (80.0, 60.0))
+_ANCHORS = ((20.0, 45.0), (100.0, 75.0))
 
 
 def slots(seen: Seen) -> Tensor:

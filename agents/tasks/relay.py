@@ -28,6 +28,7 @@ from coloc_env.world import World
 _SIZE, _RADIUS, _V_MAX = (160.0, 100.0), 40.0, 3.0
 _ANCHORS = ((0.0, 20.0), (0.0, 50.0), (0.0, 80.0))
 _AHEAD = 4.0  # s that the greedy policy looks ahead
+_MARGIN, _FADES = 3.0, 1.0  # m: how a range's worth fades about the radius
 _HEADINGS = torch.cat(
     (
         torch.zeros(1, 2),
@@ -91,14 +92,14 @@ def _information(place: Float32[Tensor, "B N 2"], task: Task) -> Tensor:
     b, n = place.shape[:2]
     unit, distance, variance = directions(place, place)
     unit = unit.double()
-    weight = (torch.sigmoid((task.radius - 2.0 - distance) / 1.0) / variance).double()
+    weight = (torch.sigmoid((task.radius - _MARGIN - distance) / _FADES) / variance).double()
     weight.diagonal(dim1=1, dim2=2).zero_()
     each = weight[..., None, None] * unit.unsqueeze(-1) * unit.unsqueeze(-2)
     blocks = -each
     own = each.sum(2)
     to, far, spread = directions(place, task.anchors.expand(b, -1, -1))
     to = to.double()
-    heard = (torch.sigmoid((task.radius - 2.0 - far) / 1.0) / spread).double()
+    heard = (torch.sigmoid((task.radius - _MARGIN - far) / _FADES) / spread).double()
     own = own + (heard[..., None, None] * to.unsqueeze(-1) * to.unsqueeze(-2)).sum(2)
     i = torch.arange(n)
     blocks[:, i, i] = own

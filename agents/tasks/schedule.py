@@ -27,7 +27,7 @@ from coloc_env.scenario import Prior
 from coloc_env.world import World
 
 _SIDE, _RADIUS = 100.0, 45.0
-_ANCHORS = ((30.0, 50.0), (70.0, 50.0))
+_ANCHORS = ((0.0, 0.0), (100.0, 100.0))
 
 
 def own_gain(seen: Seen) -> Tensor:
@@ -182,6 +182,8 @@ class Schedule(Task):
         distance = distance.gather(2, target)
         own = gains.diagonal(dim1=1, dim2=3).transpose(1, 2)  # [B, i, target]
         inside = (distance <= self.radius).to(p.dtype)
+        if self.scenario.strangers:
+            inside[..., : n - 1] = 0.0
         memory.more["gain"] = own.gather(2, target) * inside
         memory.more["team_gain"] = gains.sum(-1).gather(2, target) * inside
         memory.more["distance"] = distance

@@ -4,9 +4,10 @@ A task is an action mode (``coloc_env.envs.actions``): a memory that goes from s
 pure functions of it. What agents see is made of estimates alone; rewards are of the truth.
 """
 
+import copy
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -19,7 +20,7 @@ from agents.registry import make
 from coloc_env.commands import Commands
 from coloc_env.envs.actions import ActionMode, Leaves
 from coloc_env.observation import Observation
-from coloc_env.scenario import DisplacementDriven, Prior, Scenario
+from coloc_env.scenario import DisplacementDriven, Scenario
 from coloc_env.sensors import AnchorRanging, Displacement, RangeNoise, Ranging, Sensor
 from coloc_env.sensors.base import Leaf
 from coloc_env.world import World
@@ -77,7 +78,7 @@ class Task(ActionMode):
     """Base of all tasks: ``scenario``, ``n_agents`` UAVs that act, and an ``estimator`` by name.
 
     ``policies``: heuristics by name, ``random`` and ``idle`` among them; ``best``: the best one
-    that is known, and ``known`` its return and those of others (means over the protocol's worlds).
+    that is known.
     """
 
     rewards = True
@@ -119,6 +120,13 @@ class Task(ActionMode):
             self._size = self.observe(memory, observation)[1]["observation"].shape[-1]
         mask = {} if self.choices is None else {"action_mask": Leaf(self.choices, 0.0, 1.0)}
         return {"observation": Leaf(self._size, -1.0, 1.0), **mask}
+
+    def without_cooperation(self) -> "Task":
+        """The same task for UAVs that cannot range each other."""
+        alone = copy.copy(self)
+        alone.scenario = replace(self.scenario, strangers=self._n)
+        alone.believed = alone.scenario.believed
+        return alone
 
     # ---------------------------------------------------------------- the estimator in the loop
 
@@ -331,6 +339,3 @@ def towards(seen: Seen, goal: Float[Tensor, "B n d"], slow: float = 1.0) -> Floa
     length = (apart * apart).sum(-1, keepdim=True).sqrt().clamp_min(1e-6)
     speed = (length / slow).clamp(max=seen.task.v_max) / seen.task.v_max
     return apart / length * speed
-
-
-__all__ = ["MOST_ERROR", "NOISE", "Policy", "Prior", "Seen", "Task", "TaskMemory"]
