@@ -27,8 +27,10 @@ from coloc_env.world import World
 
 _SIZE, _RADIUS, _V_MAX = (160.0, 100.0), 40.0, 3.0
 _ANCHORS = ((0.0, 20.0), (0.0, 50.0), (0.0, 80.0))
-_AHEAD = 4.0  # s that the greedy policy looks ahead
-_MARGIN, _FADES = 3.0, 1.0  # m: how a range's worth fades about the radius
+_SCOUTS = ((80.0, 25.0), (130.0, 75.0))  # m: where they roam
+_OWN = 0.05  # weight of the relays' own variance, beside the scouts'
+_AHEAD = 3.0  # s that the greedy policy looks ahead
+_TAIL, _FADES = 0.02, 20.0  # what a range out of reach is worth, that there is a way back, and m
 _HEADINGS = torch.cat(
     (
         torch.zeros(1, 2),
@@ -69,9 +71,9 @@ def greedy(seen: Seen) -> Tensor:
     ahead[:, n:] += _AHEAD * seen.memory.velocity[:, n:]
     high = torch.tensor(_SIZE)
     ahead = torch.minimum(ahead.clamp_min(0.0), high)
-    best = []
-    for i in range(n):
-        moved = ahead[:, i].unsqueeze(1) + _AHEAD * task.v_max * _HEADINGS
+    best = torch.zeros(b, n, 2)
+    for i in 2 * list(range(n)):
+        moved = seen.position[:, i].unsqueeze(1) + _AHEAD * task.v_max * _HEADINGS
         moved = torch.minimum(moved.clamp_min(0.0), high)  # [B, 9, 2]
         place = ahead.unsqueeze(1).repeat(1, len(_HEADINGS), 1, 1)
         place[:, :, i] = moved
@@ -79,11 +81,11 @@ def greedy(seen: Seen) -> Tensor:
             b, len(_HEADINGS), *prior.shape[1:]
         )
         after = torch.linalg.inv(information).diagonal(dim1=-2, dim2=-1)
-        cost = after[..., 2 * n :].sum(-1) + 0.02 * after[..., : 2 * n].sum(-1)
+        cost = after[..., 2 * n :].sum(-1) + _OWN * after[..., : 2 * n].sum(-1)
         choice = cost.argmin(-1)
-        best.append(_HEADINGS[choice])
+        best[:, i] = _HEADINGS[choice]
         ahead[:, i] = moved[torch.arange(b), choice]
-    return torch.stack(best, 1)
+    return best
 
 
 def _information(place: Float32[Tensor, "B N 2"], task: Task) -> Tensor:
@@ -92,18 +94,24 @@ def _information(place: Float32[Tensor, "B N 2"], task: Task) -> Tensor:
     b, n = place.shape[:2]
     unit, distance, variance = directions(place, place)
     unit = unit.double()
-    weight = (torch.sigmoid((task.radius - _MARGIN - distance) / _FADES) / variance).double()
+    weight = (_reached(distance, task.radius) / variance).double()
     weight.diagonal(dim1=1, dim2=2).zero_()
     each = weight[..., None, None] * unit.unsqueeze(-1) * unit.unsqueeze(-2)
     blocks = -each
     own = each.sum(2)
     to, far, spread = directions(place, task.anchors.expand(b, -1, -1))
     to = to.double()
-    heard = (torch.sigmoid((task.radius - _MARGIN - far) / _FADES) / spread).double()
+    heard = (_reached(far, task.radius) / spread).double()
     own = own + (heard[..., None, None] * to.unsqueeze(-1) * to.unsqueeze(-2)).sum(2)
     i = torch.arange(n)
     blocks[:, i, i] = own
     return blocks.transpose(2, 3).reshape(b, 2 * n, 2 * n)
+
+
+def _reached(distance: Tensor, radius: float) -> Tensor:
+    """How much of a range counts: all within the radius, little beyond, less the farther."""
+    beyond = (distance - radius + 1.0).clamp_min(0.0)
+    return torch.where(beyond == 0, 1.0, _TAIL * (-beyond / _FADES).exp())
 
 
 class Relay(Task):
@@ -134,7 +142,7 @@ class Relay(Task):
     ) -> None:
         total = n_uavs + scouts
         steered = Steered("velocity", _V_MAX, 1.5, ((5.0, 20.0), (60.0, 80.0)))
-        roam = Roam(1.5, ((80.0, 10.0), (150.0, 90.0)))
+        roam = Roam(1.5, _SCOUTS)
         scenario = task_scenario(
             "relay-v0",
             sensors(_ANCHORS, 0.3, drift, _RADIUS),

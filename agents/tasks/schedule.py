@@ -167,6 +167,7 @@ class Schedule(Task):
         return memory, memory.action
 
     def start(self, blank: Float32[Tensor, "B N"]) -> dict[str, Tensor]:
+        assert self.choices is not None
         each = blank.unsqueeze(-1).repeat(1, 1, self.choices - 1)
         names = ("gain", "team_gain", "distance")
         return {"called": blank.clone(), **{name: each.clone() for name in names}}

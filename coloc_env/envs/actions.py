@@ -7,7 +7,7 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -37,7 +37,7 @@ class ActionMode(ABC):
     ``rewards``: rewards are its own, of what is estimated after the step.
     """
 
-    name: ClassVar[str]
+    name: str
     choices: int | None = None
     whole: bool = False
     meaning: str
