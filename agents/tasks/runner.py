@@ -7,19 +7,21 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from agents.tasks.task import Policy, Seen, Task
+from agents.tasks.task import Policy, Seen, Task, TaskMemory
 from coloc_env.envs.actions import ModeRunner, checked_tensor
 from coloc_env.world import World
 
 
 @dataclass(frozen=True)
 class TaskStep:
-    """Rewards [B, n] of a step, the action, and the worlds after it; ``error`` [B, N] (m)."""
+    """What was ``seen``, the ``action`` and its ``reward`` [B, n]; the ``world`` and ``memory`` after
+    the step, and the ``error`` [B, N] (m) there."""
 
     reward: Float32[Tensor, "B n"]
     action: Tensor
     error: Float32[Tensor, "B N"]
     world: World
+    memory: TaskMemory
     seen: Seen
 
 
@@ -38,7 +40,7 @@ def rollout(
         step = runner.step(runner.estimate(action))
         leaves = runner.observe()
         error = task.error(runner.memory, world)
-        yield TaskStep(step.reward, action, error, world, seen)
+        yield TaskStep(step.reward, action, error, world, runner.memory, seen)
 
 
 def _seen(
