@@ -16,7 +16,7 @@ from coloc_env.sensors import Sensor
 
 
 class Estimate(TensorClass):
-    """What each UAV says of its own state at the step observed; world frame, batch (B, N).
+    """Each UAV's estimate of its own state at the step observed; world frame, batch (B, N).
 
     ``position`` (m), ``velocity`` (m/s), ``covariance`` of the position (m²).
     """
@@ -84,33 +84,33 @@ class Localizer(ABC, Generic[Belief]):
         """The mean state of a belief, as ``agents.models.process`` lays states out."""
         raise ValueError(f"{self.name} has no mean state")
 
-    def moved(self, belief: Belief, offset: Float[Tensor, "B N d"]) -> Belief:
+    def shifted(self, belief: Belief, offset: Float[Tensor, "B N d"]) -> Belief:
         """The belief with its position shifted by ``offset`` (m), as sure of it as before."""
         raise ValueError(f"{self.name} cannot be corrected from outside")
 
-    def watch(self, belief: Belief, observation: Observation) -> Belief:
-        """``step`` for one whose estimate is not asked for: cheaper where it can be."""
+    def advance(self, belief: Belief, observation: Observation) -> Belief:
+        """The belief that ``step`` returns, without the estimate: cheaper where it can be."""
         return self.step(belief, observation)[0]
 
     def gaussian(
         self, belief: Belief, observation: Observation
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-        """Mean state and error covariance (float64) after the observation was used or watched."""
+        """Mean state and error covariance (float64) after the observation was used."""
         raise ValueError(f"{self.name} gives no Gaussian to restart another filter from")
 
-    def restarted(
+    def restart_from(
         self,
         belief: Belief,
         rows: Bool[Tensor, "B N"],
         state: Float[Tensor, "B N S"],
         covariance: Float[Tensor, "B N E E"],
     ) -> Belief:
-        """The belief with the UAVs marked in ``rows`` begun anew from a Gaussian, which has taken
+        """The belief with the UAVs marked in ``rows`` restarted from a Gaussian, which has taken
         the last observation into account."""
         raise ValueError(f"{self.name} cannot be restarted from outside")
 
     def team(self, belief: Belief) -> Float[Tensor, "B N N P"] | None:
-        """What each UAV says of everybody's pose relative to UAV 0's (position in m, quaternion or
+        """Each UAV's estimate of everybody's pose relative to UAV 0's (position in m, quaternion or
         heading in rad), where a method estimates that."""
         return None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from coloc_env import options
@@ -94,14 +95,11 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
     ignored = _ignored(factory, believed)
     if not ignored:
         return
-    measuring = [sensor for sensor in believed.sensors if sensor.informs]
+    used = {type(one).__name__ for one in believed.sensors if model_of(type(one))}
     general = getattr(factory, "serves", None) is None
-    if general and any(model_of(type(sensor)) for sensor in measuring):
-        warnings.warn(
-            f"{name}: {', '.join(ignored)} has no measurement model and is not used "
-            "(agents.models.measurements.measures registers one)",
-            stacklevel=3,
-        )
+    if general and used and used.isdisjoint(ignored):
+        for sensor in ignored:
+            _warn_of_unmodelled(sensor)
     else:
         others = [one for one in LOCALIZERS if not _ignored(LOCALIZERS[one], believed)]
         raise ValueError(
@@ -110,12 +108,16 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
         )
 
 
+@cache
+def _warn_of_unmodelled(sensor: str) -> None:
+    """Once for each kind of sensor, however many localizers are made."""
+    warnings.warn(
+        f"{sensor} has no measurement model: localizers do not use it "
+        "(agents.models.measurements.measures registers one)",
+        stacklevel=4,
+    )
+
+
 def _ignored(factory: Factory, believed: Believed) -> list[str]:
     ignores = getattr(factory, "ignores", None)
     return [] if ignores is None else ignores(believed)
-
-
-def _uses_all(factory: Factory, believed: Believed) -> bool:
-    from coloc_env.sensors import Sensor
-
-    return not _ignored(factory, believed) and getattr(factory, "serves", None) != (Sensor,)

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 
+_ACTION = "m, m/s, log m"
+_PRIOR = "m, m/s, attitude; their σ"
+
+
 @dataclass(frozen=True, slots=True)
 class Observation:
     """What N UAVs of B worlds observe at one step: float32 leaves [B, N, F] by name.
@@ -63,7 +67,7 @@ def prior_action(observation: Observation, dim: int) -> Float32[Tensor, "B N A"]
 
 def static_leaves(scenario: Scenario) -> dict[str, Leaf]:
     """Leaves that stay the same over an episode: the prior and the maps."""
-    leaves = {"prior": Leaf(prior_width(scenario.arena.dim))}
+    leaves = {"prior": Leaf(prior_width(scenario.arena.dim), unit=_PRIOR, frame="world")}
     for sensor in scenario.sensors:
         leaves |= sensor.map_leaves(scenario.layout)
     return leaves
@@ -89,7 +93,7 @@ def message_leaves(scenario: Scenario) -> dict[str, Leaf]:
     """What other UAVs' messages bring: per slot the sender's action, and whether one came."""
     slots = scenario.layout.slots
     return {
-        "messages": Leaf(slots * action_width(scenario)),
+        "messages": Leaf(slots * action_width(scenario), unit=_ACTION, frame="world"),
         "message_mask": Leaf(slots, *MASK),
     }
 

@@ -60,7 +60,7 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
 
     ``robust``: Huber's loss on matches, ``gnc`` (graduated non-convexity with truncated least
     squares, Yang et al. 2020), or ``none``. Solved at every ``every``-th step, and propagated
-    by odometry in between. Needs GTSAM (``pip install coloc[graph]``).
+    by odometry in between. Needs GTSAM (``pip install coloc-env[graph]``).
     """
 
     name = "pose_graph"
@@ -73,7 +73,7 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
         try:
             import gtsam
         except ImportError as error:
-            raise ValueError("GTSAM is missing: pip install coloc[graph]") from error
+            raise ValueError("GTSAM is missing: pip install coloc-env[graph]") from error
         self.gtsam, self.robust, self.every = gtsam, robust, every
 
     def reset(self, observation: Observation) -> PoseGraphBelief:

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.filter import GaussianFilter
-from agents.models.measurements import Block, Neighbours, heard, make_measurements
-from agents.models.update import information, iterated_update, linearizer, posterior
+from agents.models.measurements import Block, Neighbours, make_measurements, received
+from agents.models.update import information, iterated_update, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
 # Weights tried by covariance intersection.
@@ -43,14 +44,12 @@ class CooperativeEkf(GaussianFilter):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: float = 0.999,
+        gate: OpenShare = 0.999,
         fusion: Literal["naive", "ci"] = "naive",
-        iterations: int = 2,
+        iterations: PositiveCount = 2,
         cooperate: bool = True,
     ) -> None:
         super().__init__(believed)
-        if iterations < 1:
-            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.iterations, self.fusion = iterations, fusion
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
@@ -67,9 +66,8 @@ class CooperativeEkf(GaussianFilter):
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
         if not self.models:
             return super().update(prior)
-        neighbours = heard(self.believed, prior.observation)
-        linearize = linearizer(self.process, self.models, prior.observation, neighbours)
-        found = iterated_update(prior, linearize, self.screen, self.iterations)
+        neighbours = received(self.believed, prior.observation)
+        found = iterated_update(prior, neighbours, self.screen, self.iterations)
         if self.fusion == "naive":
             return found.state, found.covariance, found.memory
         x, covariance = self._split(prior, neighbours, found.trusts)
@@ -86,13 +84,12 @@ class CooperativeEkf(GaussianFilter):
         x, covariance = prior.state, prior.covariance
         if own:
             models, fixed = zip(*own, strict=True)
-            linearize = linearizer(self.process, models, prior.observation, neighbours)
             screen = Fixed(self.process, models, fixed)
-            found = iterated_update(prior, linearize, screen, self.iterations)
+            found = iterated_update(prior, neighbours, screen, self.iterations)
             x, covariance = found.state, found.covariance
         if shared:
             models, fixed = zip(*shared, strict=True)
-            blocks = linearizer(self.process, models, prior.observation, neighbours)(x)
+            blocks = [m.linearize(self.process, x, prior.observation, neighbours) for m in models]
             x, covariance = self._intersect(x, covariance, blocks, fixed)
         return x, covariance
 

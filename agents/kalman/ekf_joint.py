@@ -9,17 +9,19 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, Neighbours, make_measurements
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
+from agents.models.ordered_update import Estimation, ordered_update
 from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import Prediction, RobustScreen, Trust
 from coloc_env.observation import Observation
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
 
@@ -28,7 +30,7 @@ class JointEkf(Localizer[GaussianBelief]):
 
     ``second_order``: ranges are expanded to the second order, so that what is uncertain across a
     line of sight makes its range longer and less certain (Jazwinski 1970, section 9.3; without
-    tags' lever arms only).
+    tags' lever arms only), where priors are broad too.
 
     Its belief's covariance is [B, N, E, N · E]: each UAV's rows of the joint matrix.
     """
@@ -41,8 +43,8 @@ class JointEkf(Localizer[GaussianBelief]):
         believed: Believed,
         *,
         robust: str = "none",
-        gate: float = 0.999,
-        iterations: int = 2,
+        gate: OpenShare = 0.999,
+        iterations: PositiveCount = 2,
         cooperate: bool = True,
         second_order: bool = False,
     ) -> None:
@@ -52,8 +54,6 @@ class JointEkf(Localizer[GaussianBelief]):
                 f"ekf_joint: a team of {believed.arena.n_uavs} with {believed.slots} neighbour "
                 "slots is too large for it; raise max_neighbours to the team's size"
             )
-        if iterations < 1:
-            raise ValueError(f"iterations={iterations} is not allowed: at least 1")
         self.process, self.iterations = make_process(believed), iterations
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen = RobustScreen(self.process, self.models, robust, gate)
@@ -84,6 +84,7 @@ class JointEkf(Localizer[GaussianBelief]):
         f, q = self.process.linearize(belief.state, u, dt)
         x = self.process.propagate(belief.state, u, dt)
         p = belief.covariance.unflatten(-1, (n, e)).transpose(2, 3)  # [B, N, N, E, E]
+        # P_ij ← F_i P_ij F_jᵀ + δ_ij Q_i
         p = f.unsqueeze(2) @ p @ f.mT.unsqueeze(1) + _diagonal(q).transpose(2, 3)
         p = p.transpose(2, 3).reshape(b, n * e, n * e)
         x, p, memory = self._update(x, p, observation, belief.memory)
@@ -96,8 +97,8 @@ class JointEkf(Localizer[GaussianBelief]):
     def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
         return belief.state
 
-    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
-        return belief.moved(offset)
+    def shifted(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.shifted(offset)
 
     def _update(
         self,
@@ -107,21 +108,23 @@ class JointEkf(Localizer[GaussianBelief]):
         memory: Float[Tensor, "B N K"],
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B M M"], Float[Tensor, "B N K"]]:
         """Iterated update of the joint state; neighbours are where the joint mean has them."""
+        if not self.models:
+            return x, p, memory
         n, e = x.shape[1], self.process.error_size
         prior = Prediction(x, self._own(p), observation, memory)
         state, updated, delta = x, p, torch.zeros_like(p[..., 0])
         evidence: Any = None
-        extra = 0
-        if self.screen.extra:
-            broad = prior.broad(self.process.dim).any(-1, keepdim=True)
-            extra = self.screen.extra if bool(broad.any()) else 0
+        trusts: list[Trust] = []
+        broad = prior.broad(self.process.dim).any(-1, keepdim=True)
+        any_broad = bool(broad.any())
+        extra = self.screen.extra if any_broad else 0
         for iteration in range(-extra, self.iterations):
             blocks = self._blocks(state, observation)
             if self.second_order:
                 blocks = self._expanded(blocks, p, observation)
             judged = blocks
             if self.screen.judges:
-                judged = [self._doubtful(block, updated) for block in blocks]
+                judged = [self._with_partners(block, updated) for block in blocks]
             if iteration == -extra:
                 evidence = self.screen.judge(judged, prior)
             trusts = self.screen.weigh(judged, evidence, iteration == self.iterations - 1)
@@ -130,9 +133,21 @@ class JointEkf(Localizer[GaussianBelief]):
                 vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
             delta, updated = posterior(p, precision, vector)
             state = self.process.boxplus(x, delta.unflatten(-1, (n, e)))
-            if iteration < 0:  # what is not broad has not begun
+            if iteration < 0:  # extra iterations are for broad priors alone
                 delta = torch.where(broad, delta, 0.0)
                 state = torch.where(broad.unsqueeze(-1), state, x)
+        if any_broad and not self.second_order:
+            model = Estimation(
+                lambda at: self._blocks(at, observation),
+                self._information,
+                lambda at, delta: self.process.boxplus(at, delta.unflatten(-1, (n, e))),
+                self._apart,
+                self.process.dt,
+            )
+            rounds = round_robin(n, x.device)
+            by_order, narrowed = ordered_update(x, p, model, trusts, rounds, n)
+            state = torch.where(broad.unsqueeze(-1), by_order, state)
+            updated = torch.where(broad.unsqueeze(-1), narrowed, updated)
         memory = self.screen.remember(prior, evidence, lambda: self._blocks(state, observation))
         return state, updated, memory
 
@@ -141,6 +156,16 @@ class JointEkf(Localizer[GaussianBelief]):
         e = self.process.error_size
         split = p.unflatten(-1, (-1, e)).unflatten(1, (-1, e))
         return split.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+
+    def _apart(
+        self, p: Float[Tensor, "B M M"], partner: Int64[Tensor, "N"]
+    ) -> Float[Tensor, "B N d d"]:
+        """Covariance of the UAVs' positions relative to their partners' (cross-covariances
+        included): M = P_ii + P_jj − P_ij − P_ji."""
+        n, d, i = len(partner), self.process.dim, torch.arange(len(partner), device=p.device)
+        blocks = p.unflatten(-1, (n, -1)).unflatten(1, (n, -1)).transpose(2, 3)[..., :d, :d]
+        own, cross = blocks[:, i, i], blocks[:, i, partner]
+        return own + own[:, partner] - cross - cross.mT
 
     def _blocks(self, x: Float[Tensor, "B N S"], observation: Observation) -> list[Block]:
         neighbours = self._neighbours(x)
@@ -166,14 +191,14 @@ class JointEkf(Localizer[GaussianBelief]):
             unit = block.jacobian[..., 0, :d]  # [B, N, m, d]
             along = ((relative @ unit.unsqueeze(-1))[..., 0] * unit).sum(-1)
             across = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - along
-            measured = observation[model.leaf].to(across.dtype)
+            measured = model.read(observation)[0].to(across.dtype)
             distance = (measured - block.residual[..., 0]).clamp_min(1e-3)
             longer = (0.5 * across.clamp_min(0.0) / distance).unsqueeze(-1)
             residual, variance = block.residual - longer, block.variance + 2 * longer**2
             found.append(replace(block, residual=residual, variance=variance))
         return found
 
-    def _doubtful(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
+    def _with_partners(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
         """The block as one UAV alone would judge it: with what its partners do not know of
         themselves as noise."""
         if block.partner is None or block.partner_variance is None:
@@ -217,6 +242,18 @@ class JointEkf(Localizer[GaussianBelief]):
             residuals.append(trust.residual(block).flatten(1))
         h, wh = torch.cat(rows, 1), torch.cat(scaled, 1)
         return h.mT @ wh, (wh.mT @ torch.cat(residuals, 1).unsqueeze(-1))[..., 0]
+
+
+def round_robin(n: int, device: torch.device) -> Int64[Tensor, "rounds n"]:
+    """Who meets whom in each round of a tournament (circle method): every pair once, in as few
+    rounds as possible. Where n is odd, one UAV a round meets itself."""
+    even = n + n % 2
+    i, r = torch.arange(even - 1), torch.arange(even - 1).unsqueeze(-1)
+    partner = (r - i) % (even - 1)
+    partner = torch.where(partner == i, even - 1, partner)
+    last = (partner == even - 1).long().argmax(-1, keepdim=True)
+    partner = torch.cat((partner, last), -1)[:, :n]
+    return torch.where(partner < n, partner, torch.arange(n)).to(device)
 
 
 def _diagonal(blocks: Float[Tensor, "B N E E"]) -> Float[Tensor, "B N E N E"]:

@@ -5,7 +5,7 @@ happened before the window is forgotten, and so is any failure.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -15,11 +15,18 @@ from torch import Tensor
 from agents.kalman.dead_reckoning import DeadReckoning
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import Block, make_measurements, nobody
+from agents.models.measurements import (
+    AnchorRanges,
+    Block,
+    make_measurements,
+    model_of,
+    no_neighbours,
+)
 from agents.models.process import Process
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
+from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Layout
@@ -30,7 +37,7 @@ _RIDGE = 1e-3  # m⁻²: what keeps a trilateration near the arena's centre wher
 
 class WindowBelief(TensorClass):
     """What was measured in the last M steps, the newest last (zeros before the first), steps taken,
-    and dead reckoning of what a short window cannot tell (attitude, biases); batch (B, N)."""
+    and dead reckoning of what a short window does not observe (attitude, biases); batch (B, N)."""
 
     window: Float32[Tensor, "B N M F"]
     step: Int64[Tensor, "B N"]
@@ -53,7 +60,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     With Z = H̄ x_k + Ḡ w + v stacked over the window and Ξ = Ḡ Q̄ Ḡᵀ + R̄:
     x̂ = (H̄ᵀ Ξ⁻¹ H̄)⁻¹ H̄ᵀ Ξ⁻¹ Z and P = (H̄ᵀ Ξ⁻¹ H̄)⁻¹, h linearized ``iterations`` times. It uses
     what the UAV measures itself and needs no prior but, where the motion model has an attitude (and
-    biases), their dead reckoning. Where the window does not tell the state, P says so.
+    biases), their dead reckoning. Where the window does not observe the state, P is large.
     ``robust=huber`` widens the variance of what is far from the iterate it is linearized about.
     """
 
@@ -63,23 +70,29 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self,
         believed: Believed,
         *,
-        memory: int = 3,
-        iterations: int = 4,
+        memory: Annotated[int, Quantity("steps", 2, 1000)] = 3,
+        iterations: PositiveCount = 4,
         robust: Literal["none", "huber"] = "none",
     ) -> None:
         super().__init__(believed)
-        if memory < 2 or iterations < 1:
-            raise ValueError(
-                f"memory={memory}, iterations={iterations} is not allowed: at least 2 steps and 1"
-            )
         self.size, self.iterations, self.robust = memory, iterations, robust == "huber"
         self.reckoning = DeadReckoning(believed)
         self.process: Process = self.reckoning.process
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
         if not self.models:
+            raise ValueError("the team measures nothing of its own to estimate from")
+        if not self.models:
             raise ValueError("needs measurements of landmarks or anchors, and the team has none")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
+
+    @classmethod
+    def ignores(cls, believed: Believed) -> list[str]:
+        """What is measured between UAVs too, where that is all there is to estimate from."""
+        sensors = [s for s in believed.sensors if model_of(type(s)) is not None]
+        alone = sensors and all(sensor.between_uavs for sensor in sensors)
+        between = [type(sensor).__name__ for sensor in sensors] if alone else []
+        return super().ignores(believed) + between
 
     def reset(self, observation: Observation) -> WindowBelief:
         width = self._row(observation).shape[-1]
@@ -92,11 +105,11 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
             batch_size=step.shape,
         )
 
-    def watch(self, belief: WindowBelief, observation: Observation) -> WindowBelief:
+    def advance(self, belief: WindowBelief, observation: Observation) -> WindowBelief:
         row = self._row(observation).unsqueeze(-2)
         reckoned = belief.reckoned
         if self.process.attitude_size:
-            reckoned = self.reckoning.watch(reckoned, observation)
+            reckoned = self.reckoning.advance(reckoned, observation)
         return build(
             WindowBelief,
             belief.step.shape,
@@ -106,7 +119,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         )
 
     def step(self, belief: WindowBelief, observation: Observation) -> tuple[WindowBelief, Estimate]:
-        after = self.watch(belief, observation)
+        after = self.advance(belief, observation)
         return after, gaussian_estimate(self.process, *self.gaussian(after, observation))
 
     def gaussian(
@@ -203,7 +216,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     ]:
         """Each step's own rows: ∂h/∂δ, residuals and variances; a row of zeros with variance 1
         where nothing was measured."""
-        alone = nobody(path[..., : self.process.dim])
+        alone = no_neighbours(path[..., : self.process.dim])
         rows = [self._rows(m.linearize(self.process, path, leaves, alone)) for m in self.models]
         jacobian, residual, variance = (torch.cat(parts, 3) for parts in zip(*rows, strict=True))
         return jacobian, residual, variance
@@ -222,11 +235,13 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         linear in (p, ‖p‖²). The arena's centre without anchors."""
         d, arena = self.process.dim, self.believed.arena
         centre = leaves["prior"].new_tensor(arena.centre).double()
-        if self.believed.sensor(AnchorRanging) is None:
+        sensor = self.believed.sensor(AnchorRanging)
+        if sensor is None:
             return centre.expand(*leaves["prior"].shape[:2], d)
         anchors = leaves["anchor_map"].double().unflatten(-1, (-1, d)) - centre
-        ranges = leaves["anchor_ranges"].double().unflatten(-1, (-1, anchors.shape[-2]))
-        there = leaves["anchor_range_mask"].double().unflatten(-1, ranges.shape[-2:])
+        z, mask = AnchorRanges(sensor).read(leaves)
+        ranges = z.double().unflatten(-1, (-1, anchors.shape[-2]))
+        there = mask.double().unflatten(-1, ranges.shape[-2:])
         ones = torch.ones_like(anchors[..., :1])
         design = torch.cat((-2 * anchors, ones), -1).unsqueeze(-3)
         design = (design * there.unsqueeze(-1)).flatten(2, 4)

@@ -12,9 +12,6 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-# Weights tried by covariance intersection.
-_OMEGA = (1.0, 0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)
-
 
 class GaussianBelief(TensorClass):
     """Mean state, error covariance (float64), steps taken, and what a screen remembers of earlier
@@ -25,7 +22,7 @@ class GaussianBelief(TensorClass):
     step: Int64[Tensor, "B N"]
     memory: Float[Tensor, "B N K"]
 
-    def moved(self, offset: Float[Tensor, "B N d"]) -> "GaussianBelief":
+    def shifted(self, offset: Float[Tensor, "B N d"]) -> "GaussianBelief":
         """Its position shifted by ``offset`` (m)."""
         d = offset.shape[-1]
         return self.replace(
@@ -45,13 +42,14 @@ def predict(
     dt = elapsed(process, belief.step).double()
     u = process.inputs(observation)
     f, q = process.linearize(belief.state, u, dt)
-    return process.propagate(belief.state, u, dt), f @ belief.covariance @ f.mT + q
+    x = process.propagate(belief.state, u, dt)  # x⁻ = f(x, u)
+    return x, f @ belief.covariance @ f.mT + q  # P⁻ = F P Fᵀ + Q
 
 
 def gaussian_estimate(
     process: Process, x: Float[Tensor, "B N S"], covariance: Float[Tensor, "B N E E"]
 ) -> Estimate:
-    """What a Gaussian belief says of position and velocity."""
+    """Position, velocity and their covariance of a Gaussian belief."""
     d = process.dim
     return build(
         Estimate,
@@ -98,15 +96,15 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
         return belief.state
 
-    def moved(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
-        return belief.moved(offset)
+    def shifted(self, belief: GaussianBelief, offset: Float[Tensor, "B N d"]) -> GaussianBelief:
+        return belief.shifted(offset)
 
     def gaussian(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
         return belief.state, belief.covariance
 
-    def restarted(
+    def restart_from(
         self,
         belief: GaussianBelief,
         rows: Bool[Tensor, "B N"],

@@ -28,7 +28,7 @@ from coloc_env.sensors import GRAVITY
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """What windows of samples say of the motion, whatever the states at their starts.
+    """Relative motion over windows of samples, whatever the states at their starts.
 
     Attributes:
         increments: ``[Δp (m), Δv (m/s), ΔR (quaternion)]`` in the body frame at the start, as if

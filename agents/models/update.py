@@ -1,18 +1,15 @@
-"""Gaussian measurement updates in information form: what every EKF here is made of."""
+"""Gaussian measurement updates in information form, as every EKF here uses them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.models.measurements import Block, Measurement, Neighbours
-from agents.models.process import Process
+from agents.models.measurements import Block, Neighbours
+from agents.models.ordered_update import Estimation, ordered_update
 from agents.robust.screen import Prediction, Screen, Trust
-from coloc_env.observation import Observation
-
-Linearize = Callable[[Float[Tensor, "B N S"]], Sequence[Block]]
 
 
 @dataclass(frozen=True)
@@ -23,16 +20,6 @@ class Update:
     covariance: Float[Tensor, "B N E E"]
     trusts: list[Trust]
     memory: Float[Tensor, "B N K"]
-
-
-def linearizer(
-    process: Process,
-    models: Sequence[Measurement],
-    observation: Observation,
-    neighbours: Neighbours,
-) -> Linearize:
-    """The models' blocks as a function of the state that they are linearized at."""
-    return lambda x: [m.linearize(process, x, observation, neighbours) for m in models]
 
 
 def information(
@@ -63,18 +50,23 @@ def posterior(
 
 
 def iterated_update(
-    prior: Prediction, linearize: Linearize, screen: Screen, iterations: int
+    prior: Prediction, neighbours: Neighbours, screen: Screen, iterations: int
 ) -> Update:
-    """Iterated (Gauss-Newton) EKF update of a prior, its measurements trusted as a screen says.
+    """Iterated (Gauss-Newton) EKF update of a prior, its measurements weighted by a screen.
 
-    Where the prior is broad, the screen's extra iterations come first.
+    Where the prior is broad, the screen's extra iterations come first, and what is trusted in the
+    end is then used again from the prior on, in order: see ``ordered_update``.
     """
     process, x, covariance = screen.process, prior.state, prior.covariance
     state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
-    evidence, trusts, extra = None, [], 0
-    if screen.extra:
-        broad = prior.broad(process.dim).unsqueeze(-1)
-        extra = screen.extra if bool(broad.any()) else 0
+    evidence, trusts = None, []
+    broad = prior.broad(process.dim).unsqueeze(-1)
+    any_broad = bool(broad.any())
+    extra = screen.extra if any_broad else 0
+
+    def linearize(at: Tensor) -> list[Block]:
+        return [m.linearize(process, at, prior.observation, neighbours) for m in screen.models]
+
     for iteration in range(-extra, iterations):
         blocks = linearize(state)
         if iteration == -extra:
@@ -85,7 +77,19 @@ def iterated_update(
             vector = vector + (precision @ delta.unsqueeze(-1))[..., 0]
         delta, updated = posterior(covariance, precision, vector)
         state = process.boxplus(x, delta)
-        if iteration < 0:  # what is not broad has not begun
+        if iteration < 0:  # extra iterations are for broad priors alone
             delta, state = torch.where(broad, delta, 0.0), torch.where(broad, state, x)
+    if any_broad:
+        slots, d = neighbours.known.shape[-1], process.dim
+        everyone = torch.arange(x.shape[1], device=x.device)
+
+        def apart(p: Tensor, slot: Tensor) -> Tensor:
+            return p[..., :d, :d] + torch.diag_embed(neighbours.variance[:, everyone, slot])
+
+        rounds = torch.arange(slots, device=x.device).unsqueeze(-1).expand(-1, x.shape[1])
+        model = Estimation(linearize, information, process.boxplus, apart, process.dt)
+        by_order, narrowed = ordered_update(x, covariance, model, trusts, rounds, slots)
+        state = torch.where(broad, by_order, state)
+        updated = torch.where(broad.unsqueeze(-1), narrowed, updated)
     memory = screen.remember(prior, evidence, lambda: linearize(state))
     return Update(state, updated, trusts, memory)

@@ -1,4 +1,4 @@
-"""A particle filter's belief, what a step meets, and the random numbers that are its UAV's own."""
+"""A particle filter's belief, a step's inputs, and the random numbers that are its UAV's own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class ParticleBelief(TensorClass):
     last: Float32[Tensor, "B N 2*d"]
     memory: Float[Tensor, "B N K"]
 
-    def moved(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":
+    def shifted(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":
         """Its position shifted by ``offset`` (m)."""
         d, offset = offset.shape[-1], offset.to(torch.float32)
         places = self.particles[..., :d] + offset.unsqueeze(-2)
@@ -40,7 +40,7 @@ class ParticleBelief(TensorClass):
 
 @dataclass(frozen=True)
 class Step:
-    """What a step meets: the belief before it, what is observed, what neighbours sent, how far each
+    """A step's inputs: the belief before it, what is observed, what neighbours sent, how far each
     model's measurements are trusted, and the UAVs' random keys for this step."""
 
     belief: ParticleBelief
@@ -51,7 +51,7 @@ class Step:
 
 
 def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:
-    """One random key per UAV, from what its prior says and the localizer's seed: the same UAV in
+    """One random key per UAV, from its prior leaf and the localizer's seed: the same UAV in
     the same world draws the same numbers in any batch, team subset or face."""
     bits = observation["prior"].contiguous().view(torch.int32).to(torch.int64)
     index = torch.arange(bits.shape[-1], device=bits.device)

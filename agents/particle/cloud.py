@@ -63,9 +63,9 @@ def systematic(
     count: Int64[Tensor, "B N"] | None = None,
 ) -> Int64[Tensor, "B N M"]:
     """Systematic resampling (Kitagawa 1996): ancestors of ``count`` equally weighted particles (M
-    where None); what stands in later slots is nothing to rely on.
+    where None); later slots are arbitrary.
 
-    Rung i stands at (i + offset) / count; its ancestor's number is that of the particles whose
+    Rung i is at (i + offset) / count; its ancestor's number is that of the particles whose
     cumulative weight lies below, so counting where those fall replaces M searches.
     """
     m = weights.shape[-1]

@@ -1,4 +1,4 @@
-"""The PF-NN paper's weight corrector: a small network that looks at a particle's motion."""
+"""The PF-NN paper's weight corrector: a small network on a particle's motion."""
 
 import torch
 from jaxtyping import Float

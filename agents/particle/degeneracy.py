@@ -9,13 +9,13 @@ from torch import Tensor
 from agents.particle import particle_count
 from agents.particle.belief import ParticleBelief, Step
 from agents.particle.cloud import effective_sample_size
-from agents.particle.proposal import Guide, guided, proposed
-from agents.particle.resampling import RESAMPLE, Renewal
+from agents.particle.proposal import ImportanceDensity, draw, importance_density
+from agents.particle.resampling import RESAMPLE, Resampling
 from agents.particle.tempering import Evidence, tempered
 from agents.robust import Screen
 
 _START = 3  # steps in which a likelihood is tempered down to ``RESAMPLE`` of the count
-_FEW = 0.1  # the share below which particles are drawn anew later
+_FEW = 0.1  # the share below which particles are redrawn later
 
 
 def degenerate(
@@ -29,48 +29,50 @@ def degenerate(
 
 
 @dataclass(frozen=True)
-class Remedy:
-    """What a step does for UAVs that its evidence leaves too few particles."""
+class Rejuvenation:
+    """What is done for UAVs whose weights degenerate in a step."""
 
     evidence: Evidence
     screen: Screen
-    renewal: Renewal
+    resampling: Resampling
     now: Step
 
-    def mended(
+    def rejuvenate(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         gain: Float32[Tensor, "B N M"],
         few: Bool[Tensor, "B N"],
-        guide: Guide | None,
+        density: ImportanceDensity | None,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
         """Particles and unnormalized log-weights where evidence (``gain``) would leave ``few``: in
         the first steps used in stages with a resampling move after each; later, or where a screen
-        has a guide at hand, on particles drawn anew. A UAV that needs neither is not touched."""
+        has made a density already, on redrawn particles. Other UAVs keep theirs."""
         late = few if self.screen.judges else few & (self.now.belief.step >= _START)
         early = few & ~late
         if bool(late.any()):
-            floor = self.renewal.floor
-            guide = guide or guided(self.screen, floor, particles, log_weights, self.now)
-            particles, log_weights, gain = self.redrawn(particles, log_weights, gain, late, guide)
+            floor = self.resampling.floor
+            density = density or importance_density(
+                self.screen, floor, particles, log_weights, self.now
+            )
+            particles, log_weights, gain = self.redraw(particles, log_weights, gain, late, density)
         if bool(early.any()):
-            evidence, renewal, now = self.evidence, self.renewal, self.now
-            return tempered(particles, log_weights, gain, early, evidence, renewal, now)
+            evidence, resampling, now = self.evidence, self.resampling, self.now
+            return tempered(particles, log_weights, gain, early, evidence, resampling, now)
         return particles, log_weights + gain
 
-    def redrawn(
+    def redraw(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
         gain: Float32[Tensor, "B N M"],
         rows: Bool[Tensor, "B N"],
-        guide: Guide,
+        density: ImportanceDensity,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Float32[Tensor, "B N M"]]:
-        """For the UAVs marked in ``rows``: particles proposed by the guide, their log-weights, and
-        what the evidence says of them. Evidence that even they cannot follow is left to the guide:
-        its posterior, as drawn."""
-        drawn, ratio = proposed(self.renewal.process, guide, self.now, particles.shape[-2])
+        """For the UAVs marked in ``rows``: particles drawn from the density, their log-weights,
+        and their log-likelihoods. Where even those are degenerate, the density's posterior stands
+        as drawn."""
+        drawn, ratio = draw(self.resampling.process, density, self.now, particles.shape[-2])
         particles = torch.where(rows[..., None, None], drawn, particles)
         log_weights = torch.where(rows.unsqueeze(-1), ratio, log_weights)
         gain = torch.where(rows.unsqueeze(-1), self.evidence(particles, log_weights), gain)

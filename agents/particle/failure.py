@@ -1,4 +1,4 @@
-"""Has a filter failed? Detectors that look at an estimate and at the distances to anchors."""
+"""Has a filter failed? Detectors by an estimate and the distances to anchors."""
 
 from abc import ABC, abstractmethod
 from copy import deepcopy
@@ -9,19 +9,19 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional
 
-from agents.models.measurements import AnchorRanges, nobody
+from agents.models.measurements import AnchorRanges, no_neighbours
 from agents.models.process import Process
 from agents.robust.mahalanobis import chi_square
 from agents.weights import Learned
 from coloc_env.observation import Observation
 
-ANCHORS = 4  # residuals that the network looks at
+ANCHORS = 4  # residuals that the network is fed
 HIDDEN = (10, 5)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What distances to A anchors (of all tags) say of an estimate: d = rᵀ R⁻¹ r of the residuals
+    """Residuals of an estimate to A anchors (of all tags): d = rᵀ R⁻¹ r of the residuals
     r = z − h(x̂), their sizes (m; 0 where nothing was measured), and how many there are."""
 
     distance: Float32[Tensor, "B N"]
@@ -36,7 +36,7 @@ def evidence(
     observation: Observation,
 ) -> Evidence:
     """The evidence about a state (its position alone, unless tags have lever arms)."""
-    alone = nobody(state[..., : process.dim])
+    alone = no_neighbours(state[..., : process.dim])
     if model.tags:
         block = model.linearize(process, state, observation, alone, derivatives=False)
         residual, mask = block.residual[..., 0] * block.mask, block.mask
@@ -44,7 +44,7 @@ def evidence(
     else:
         ranges, anchors = model.ends(observation, alone)
         distance = (state[..., None, : process.dim] - anchors).norm(dim=-1)
-        mask = observation["anchor_range_mask"] > 0
+        mask = model.read(observation)[1]
         residual = (ranges - distance) * mask
         squared = residual.square() / model.variance
     return Evidence(squared.sum(-1).float(), residual.abs().float(), mask.sum(-1).float())
@@ -55,15 +55,13 @@ class Detector(ABC):
 
     @abstractmethod
     def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
-        """The probability that it has; a test that knows no probabilities says 0 or 1."""
+        """The probability that it has; a test without probabilities gives 0 or 1."""
 
 
 class ChiSquare(Detector):
     """Failed if d is beyond the quantile of χ² with as many degrees of freedom as ranges."""
 
     def __init__(self, quantile: float, most: int) -> None:
-        if not 0 < quantile < 1:
-            raise ValueError(f"quantile={quantile} is not allowed: a probability in (0, 1)")
         limits = [chi_square(quantile, dof) for dof in range(1, most + 1)]
         self.limits = torch.tensor((torch.inf, *limits), dtype=torch.float32)
 

@@ -8,7 +8,7 @@ Algorithms 1 and 2).
 
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
@@ -16,22 +16,24 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import heard, make_measurements, nobody
+from agents.models.measurements import make_measurements, no_neighbours, received
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
 from agents.particle.belief import ParticleBelief, Step, normal, own_keys
 from agents.particle.cloud import Moments, moments, select
-from agents.particle.degeneracy import Remedy, degenerate
+from agents.particle.degeneracy import Rejuvenation, degenerate
 from agents.particle.likelihood import log_likelihood
-from agents.particle.proposal import guided, proposed
-from agents.particle.resampling import FLOOR, Perturb, Renewal, padded, padded_weights
+from agents.particle.proposal import draw, importance_density
+from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
+Particles = Annotated[int, Quantity("", 10, 100_000)]
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -39,7 +41,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
 
     ``perturb``: ``liu_west`` moves resampled particles so that the cloud keeps its moments, above a
     small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). A likelihood that leaves
-    few particles is used in stages in the first steps; later, particles are drawn anew from 1.1 ×
+    few particles is used in stages in the first steps; later, particles are redrawn from 1.1 ×
     an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003) if
     enough survive those; ``proposal=ekf`` does so at every step.
     ``tempering=false`` uses every likelihood as it comes.
@@ -54,23 +56,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self,
         believed: Believed,
         *,
-        particles: int,
-        bounds: tuple[int, int] | None = None,
-        seed: int = 0,
+        particles: Particles,
+        bounds: tuple[Particles, Particles] | None = None,
+        seed: Count = 0,
         perturb: Perturb = "liu_west",
         tempering: bool = True,
         proposal: Proposal = "prior",
         robust: str = "none",
-        gate: float = 0.999,
+        gate: OpenShare = 0.999,
         cooperate: bool = True,
         compile: bool = False,
     ) -> None:
         super().__init__(believed)
-        if particles < 10:
-            raise ValueError(f"particles={particles} is not allowed: at least 10")
-        if bounds is not None and not 10 <= bounds[0] <= particles <= bounds[1]:
+        if bounds is not None and not bounds[0] <= particles <= bounds[1]:
             raise ValueError(
-                f"bounds={bounds} is not allowed: low,high with 10 ≤ low ≤ particles ({particles}) "
+                f"bounds={bounds} is not allowed: low,high with low ≤ particles ({particles}) "
                 "≤ high"
             )
         self.particles, self.seed, self.tempering = particles, seed, tempering
@@ -79,12 +79,13 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
-        self.renewal = Renewal(self.process, perturb, bounds)
+        self.resampling = Resampling(self.process, perturb, bounds)
         self.compiled = compile
         if compile:
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
-            self.renewal.weigh = torch.compile(self.renewal.weigh, dynamic=False)  # type: ignore[method-assign]
-            self.renewal.renew = torch.compile(self.renewal.renew, dynamic=False)  # type: ignore[method-assign]
+            self.resampling.weigh = torch.compile(self.resampling.weigh, dynamic=False)  # type: ignore[method-assign]
+            few = torch.compile(self.resampling.resample_few, dynamic=False)
+            self.resampling.resample_few = few  # type: ignore[method-assign]
 
     @property
     def exchanges(self) -> bool:
@@ -115,14 +116,16 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[ParticleBelief, Estimate]:
         key, neighbours = (
             noise.fold(belief.key, belief.step),
-            nobody(belief.last[..., : self.process.dim]),
+            no_neighbours(belief.last[..., : self.process.dim]),
         )
         if any(model.cooperative for model in self.models):
-            neighbours = heard(self.believed, observation)
+            neighbours = received(self.believed, observation)
         now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
         particles, log_weights, memory = self._updated(now)
-        weighed = self.renewal.weigh(particles, log_weights, belief.count)
-        particles, log_weights = self.renewal.renewed(particles, weighed, belief.count, key)
+        weighed = self.resampling.weigh(particles, log_weights, belief.count)
+        particles, log_weights = self.resampling.next_particles(
+            particles, weighed, belief.count, key
+        )
         mean = weighed.cloud.mean
         after = build(
             ParticleBelief,
@@ -141,10 +144,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
         return moments(self.process, belief.particles, belief.log_weights.exp()).mean
 
-    def moved(self, belief: ParticleBelief, offset: Float[Tensor, "B N d"]) -> ParticleBelief:
-        return belief.moved(offset)
+    def shifted(self, belief: ParticleBelief, offset: Float[Tensor, "B N d"]) -> ParticleBelief:
+        return belief.shifted(offset)
 
-    def restarted(
+    def restart_from(
         self,
         belief: ParticleBelief,
         rows: Bool[Tensor, "B N"],
@@ -195,21 +198,25 @@ class ParticleFilter(Localizer[ParticleBelief]):
         draws = normal(now.key, "pf.step", self.process.noise_size, slots)
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        guide, memory = None, belief.memory
+        density, memory = None, belief.memory
         if self.models and (self.screen.judges or self.proposal == "ekf"):
             particles = self.process.propagate(particles, u, dt, draws)
-            guide = guided(self.screen, self.renewal.floor, particles, log_weights, now)
-            now, memory = replace(now, trusts=guide.found.trusts), guide.found.memory
+            density = importance_density(
+                self.screen, self.resampling.floor, particles, log_weights, now
+            )
+            now, memory = replace(now, trusts=density.posterior.trusts), density.posterior.memory
             if self.proposal == "ekf":
-                particles, log_weights = proposed(self.process, guide, now, slots)
+                particles, log_weights = draw(self.process, density, now, slots)
             gain = self._evidence(particles, log_weights, now)
             few = self._degenerate(log_weights + gain, now)
         else:
             particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
         if not (self.models and bool(few.any())):
             return particles, log_weights + gain, memory
-        remedy = Remedy(partial(self._evidence, now=now), self.screen, self.renewal, now)
-        return *remedy.mended(particles, log_weights, gain, few, guide), memory
+        rejuvenation = Rejuvenation(
+            partial(self._evidence, now=now), self.screen, self.resampling, now
+        )
+        return *rejuvenation.rejuvenate(particles, log_weights, gain, few, density), memory
 
     def _foresee(
         self,
@@ -220,7 +227,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         draws: Float32[Tensor, "B N M W"],
         now: Step,
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
-        """Each particle moves with its own draw of the motion's noise, and meets the evidence;
+        """Each particle propagated with its own draw of process noise, its log-likelihood, and
         whether that leaves too few."""
         particles = self.process.propagate(particles, u, dt, draws)
         gain = self._evidence(particles, log_weights, now)
@@ -238,7 +245,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         log_weights: Float32[Tensor, "B N M"],
         now: Step,
     ) -> Float32[Tensor, "B N M"]:
-        """What the step says of each particle: log-likelihood and learned correction."""
+        """Log-likelihood of each particle, and its learned correction."""
         centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
         evidence = now.observation, now.neighbours, now.trusts
         gain = log_likelihood(self.models, self.process, particles, centre, *evidence)

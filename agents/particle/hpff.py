@@ -5,6 +5,7 @@ NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filt
 
 from agents.particle.failure import ChiSquare
 from agents.particle.hybrid import HybridFilter
+from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
 
@@ -21,8 +22,8 @@ class Hpff(HybridFilter):
         *,
         main: str = "pf",
         auxiliary: str = "emvf",
-        quantile: float = 0.98,
-        patience: int = 1,
+        quantile: OpenShare = 0.98,
+        patience: PositiveCount = 1,
     ) -> None:
         sensor = believed.sensor(AnchorRanging)
         most = 0 if sensor is None else len(sensor.anchors) * sensor.n_tags

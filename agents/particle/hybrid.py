@@ -24,7 +24,7 @@ from coloc_env.sensors import AnchorRanging
 class HybridBelief(TensorClass):
     """Both filters' beliefs, the Mahalanobis distance d and the probability of a failure that were
     found last, for how many steps in a row it counts as failed, and whether the main filter was
-    begun anew in the last; batch (B, N)."""
+    restarted in the last; batch (B, N)."""
 
     main: Any
     auxiliary: Any
@@ -37,7 +37,7 @@ class HybridBelief(TensorClass):
 class HybridFilter(Localizer[HybridBelief]):
     """Any main filter, restarted from any auxiliary one where a detector finds that it has failed.
 
-    ``main`` is a filter that can be begun anew (particle and Kalman filters), ``auxiliary`` one
+    ``main`` is a filter that can be restarted (particle and Kalman filters), ``auxiliary`` one
     that gives a Gaussian; both are named with their options (``pf@particles=2000``).
     ``threshold``: the probability beyond which a failure counts; 1: never. ``patience``: for so
     many steps in a row it must count before anything is restarted. An auxiliary that finds itself
@@ -59,13 +59,9 @@ class HybridFilter(Localizer[HybridBelief]):
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
             raise ValueError("the team has no distances to anchors to judge its filter by")
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"threshold={threshold} is not allowed: a probability in [0, 1]")
-        if patience < 1:
-            raise ValueError(f"patience={patience} is not allowed: at least 1 step")
         self.main: Localizer[Any] = make(main.replace("@", ":"), believed)
         self.auxiliary: Localizer[Any] = make(auxiliary.replace("@", ":"), believed)
-        if type(self.main).restarted is Localizer.restarted:
+        if type(self.main).restart_from is Localizer.restart_from:
             raise ValueError(f"main={main!r} is not allowed: a particle or Kalman filter")
         if type(self.auxiliary).gaussian is Localizer.gaussian:
             raise ValueError(f"auxiliary={auxiliary!r} is not allowed: emvf or a Kalman filter")
@@ -93,7 +89,7 @@ class HybridFilter(Localizer[HybridBelief]):
 
     def step(self, belief: HybridBelief, observation: Observation) -> tuple[HybridBelief, Estimate]:
         main, estimate = self.main.step(belief.main, observation)
-        auxiliary = self.auxiliary.watch(belief.auxiliary, observation)
+        auxiliary = self.auxiliary.advance(belief.auxiliary, observation)
         seen = evidence(self.model, self.process, self._state(main, estimate), observation)
         probability = self.detector.probability(seen)
         alarms = (belief.alarms + 1) * (probability > self.threshold)
@@ -103,7 +99,7 @@ class HybridFilter(Localizer[HybridBelief]):
             d = self.process.dim
             spread, like = covariance[..., :d, :d], estimate.position
             rows = rows & self._usable(state[..., :d], spread)
-            main = self.main.restarted(main, rows, state, covariance)
+            main = self.main.restart_from(main, rows, state, covariance)
             row = rows.unsqueeze(-1)
             estimate = Estimate(
                 position=torch.where(row, state[..., :d].to(like), like),
@@ -126,8 +122,8 @@ class HybridFilter(Localizer[HybridBelief]):
     def mean(self, belief: HybridBelief) -> Float[Tensor, "B N S"]:
         return self.main.mean(belief.main)
 
-    def moved(self, belief: HybridBelief, offset: Float[Tensor, "B N d"]) -> HybridBelief:
-        return belief.replace(main=self.main.moved(belief.main, offset))
+    def shifted(self, belief: HybridBelief, offset: Float[Tensor, "B N d"]) -> HybridBelief:
+        return belief.replace(main=self.main.shifted(belief.main, offset))
 
     def diagnostics(self, belief: HybridBelief) -> dict[str, Float[Tensor, "B N"]]:
         return self.main.diagnostics(belief.main) | {
@@ -139,7 +135,7 @@ class HybridFilter(Localizer[HybridBelief]):
     def _usable(
         self, position: Float[Tensor, "B N d"], covariance: Float[Tensor, "B N d d"]
     ) -> Bool[Tensor, "B N"]:
-        """Whether an auxiliary's position is one to begin anew from."""
+        """Whether an auxiliary's position is one to restart from."""
         low, high = (end.to(position.device) for end in (self._low, self._high))
         inside = ((position >= low) & (position <= high)).all(-1)
         return inside & (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) < self._anywhere)

@@ -35,11 +35,12 @@ def landmark_log_likelihood(
     centre's rotation (R = R̄ + ΔR), which keeps float32 from cancelling.
     """
     d = process.dim
-    weight = observation["landmark_mask"]
+    seen, there = model.read(observation, d)
+    weight = there.to(seen.dtype)
     if trust.weight is not None:
         weight = weight * trust.weight.to(weight.dtype)
     weight = weight.unsqueeze(-1)
-    z = observation["landmarks"].unflatten(-1, (-1, d)) * weight
+    z = seen * weight
     points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
     at = process.rotation(centre)
     if at is None:
@@ -89,7 +90,7 @@ def log_likelihood(
     neighbours: Neighbours,
     trusts: Sequence[Trust],
 ) -> Float32[Tensor, "B N M"]:
-    """Sum over all sensors' measurements, each trusted as ``trusts`` says; what a neighbour's
+    """Sum over all sensors' measurements, each weighted by ``trusts``; what a neighbour's
     uncertainty adds to a range's variance is taken at the centre."""
     total = torch.zeros_like(particles[..., 0])
     d = process.dim

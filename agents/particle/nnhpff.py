@@ -6,6 +6,7 @@ NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filt
 from agents.particle.failure import FailureDetector, NeuralDetector
 from agents.particle.hybrid import HybridFilter
 from agents.weights import learned
+from coloc_env.options import PositiveCount, Share
 from coloc_env.scenario import Believed
 
 
@@ -22,8 +23,8 @@ class NeuralHpff(HybridFilter):
         main: str = "pf",
         auxiliary: str = "emvf",
         weights: str = "nnhpff",
-        threshold: float = 0.5,
-        patience: int = 1,
+        threshold: Share = 0.5,
+        patience: PositiveCount = 1,
     ) -> None:
         network = learned(FailureDetector, weights).requires_grad_(False)
         super().__init__(believed, NeuralDetector(network), main, auxiliary, threshold, patience)

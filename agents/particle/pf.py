@@ -1,8 +1,11 @@
-"""Particle filters with a fixed number of particles, at the sizes that the papers compare."""
+"""Particle filters with a fixed number of particles, at the sizes that the papers compare.
+
+``pf500`` and ``pf800`` are not bootstrap filters throughout: see ``ParticleFilter``.
+"""
 
 from typing import Any
 
-from agents.particle.filter import ParticleFilter
+from agents.particle.filter import ParticleFilter, Particles
 from coloc_env.scenario import Believed
 
 
@@ -15,7 +18,7 @@ class Pf(ParticleFilter):
         self,
         believed: Believed,
         *,
-        particles: int = 5000,
+        particles: Particles = 5000,
         tempering: bool = False,
         **options: Any,
     ) -> None:
@@ -23,18 +26,21 @@ class Pf(ParticleFilter):
 
 
 class Pf500(ParticleFilter):
-    """SIR particle filter with 500 particles per UAV."""
+    """SIR particle filter with 500 particles per UAV: it tempers the likelihood in the first steps,
+    and later, where few particles are effective, redraws them from an EKF's posterior, with
+    importance weights (``tempering=false``: neither, plain SIR)."""
 
     name = "pf500"
 
-    def __init__(self, believed: Believed, *, particles: int = 500, **options: Any) -> None:
+    def __init__(self, believed: Believed, *, particles: Particles = 500, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)
 
 
 class Pf800(ParticleFilter):
-    """SIR particle filter with 800 particles per UAV."""
+    """SIR particle filter with 800 particles per UAV, tempered at first and redrawn from an EKF's
+    posterior as ``pf500`` is."""
 
     name = "pf800"
 
-    def __init__(self, believed: Believed, *, particles: int = 800, **options: Any) -> None:
+    def __init__(self, believed: Believed, *, particles: Particles = 800, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)

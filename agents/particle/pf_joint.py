@@ -18,7 +18,7 @@ from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
-from coloc_env.options import OpenShare, Quantity
+from coloc_env.options import Count, OpenShare, Quantity
 from coloc_env.scenario import Believed
 
 _ROUGH = 0.2  # of the annealed scale: what resampled particles are moved by
@@ -51,10 +51,10 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
         self,
         believed: Believed,
         *,
-        particles: Annotated[int, Quantity("", 2)] = 150,
+        particles: Annotated[int, Quantity("", 2, 100_000)] = 150,
         anneal: Annotated[float, Quantity("", 0.0, below=1.0)] = 0.0,
         outliers: OpenShare = 0.2,
-        seed: int = 0,
+        seed: Count = 0,
     ) -> None:
         super().__init__(believed, outliers, anneal or 1.0)
         self.particles, self.annealing, self.seed = particles, anneal > 0, seed

@@ -10,6 +10,7 @@ from agents.particle.apf import AdaptiveParticleFilter
 from agents.particle.belief import ParticleBelief
 from agents.particle.corrector import WeightCorrector, motion_features
 from agents.weights import learned
+from coloc_env.options import Factor
 from coloc_env.scenario import Believed
 
 
@@ -28,14 +29,12 @@ class NeuralParticleFilter(AdaptiveParticleFilter):
         believed: Believed,
         *,
         weights: str = "pfnn",
-        correction: tuple[float, float] = (0.4, 1.0),
+        correction: tuple[Factor, Factor] = (0.4, 1.0),
         **options: Any,
     ) -> None:
         super().__init__(believed, **options)
-        if not 0 < correction[0] <= correction[1]:
-            raise ValueError(
-                f"correction={correction} is not allowed: low,high with 0 < low ≤ high"
-            )
+        if correction[0] > correction[1]:
+            raise ValueError(f"correction={correction} is not allowed: low,high with low ≤ high")
         self.correction = correction
         self.corrector = learned(WeightCorrector, weights, self.seed)
 

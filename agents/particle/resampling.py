@@ -34,12 +34,12 @@ class Weighed:
     target: Int64[Tensor, "B N"]
 
 
-class Renewal:
+class Resampling:
     """PF-NN paper's Algorithm 2, with counts within ``bounds`` (None: they stay as they are)."""
 
     def __init__(self, process: Process, perturb: Perturb, bounds: tuple[int, int] | None) -> None:
         self.process, self.bounds = process, bounds
-        self.shrink, std = (0.7, FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
+        self.shrinkage, std = (0.7, FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
         self.floor = torch.tensor(_per_error(process, std), dtype=torch.float64)
 
     def weigh(
@@ -57,7 +57,7 @@ class Renewal:
         target = count if self.bounds is None else particle_count.adapted(count, ess, self.bounds)
         return Weighed(log_weights, weights, cloud, ess, target)
 
-    def renewed(
+    def next_particles(
         self,
         particles: Float32[Tensor, "B N M S"],
         weighed: Weighed,
@@ -70,11 +70,11 @@ class Renewal:
         if bool(self.few(weighed, count).any()):
             size, first = self.process.error_size, self.process.noise_size
             draws = normal(key, "pf.step", size, particles.shape[-2], first)
-            particles, log_weights = self.renew(particles, weighed, count, draws, key)
-        particles, log_weights = self.shrunk(particles, log_weights, weighed, count)
-        return self.buried(particles, weighed), log_weights
+            particles, log_weights = self.resample_few(particles, weighed, count, draws, key)
+        particles, log_weights = self.shrink(particles, log_weights, weighed, count)
+        return self.gathered(particles, weighed), log_weights
 
-    def renew(
+    def resample_few(
         self,
         particles: Float32[Tensor, "B N M S"],
         weighed: Weighed,
@@ -82,8 +82,7 @@ class Renewal:
         draws: Float32[Tensor, "B N M E"],
         key: Int64[Tensor, "B N"],
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
-        """Algorithm 2 but for shrinking: particles drawn anew where the effective sample size is
-        low."""
+        """Algorithm 2 but for shrinking: resampling where the effective sample size is low."""
         few = self.few(weighed, count)
         moved = self.resample(weighed.cloud, weighed.weights, weighed.target, draws, key)
         live = particle_count.alive(torch.maximum(count, weighed.target), particles.shape[-2])
@@ -97,7 +96,7 @@ class Renewal:
         """Whose effective sample size is low."""
         return weighed.ess < RESAMPLE * count.to(torch.float32)
 
-    def shrunk(
+    def shrink(
         self,
         particles: Float32[Tensor, "B N M S"],
         log_weights: Float32[Tensor, "B N M"],
@@ -126,9 +125,9 @@ class Renewal:
         """Equally weighted particles drawn from the weighted ones, then moved apart."""
         ancestors = systematic(weights, noise.unit(key), count)
         floor = self.floor.to(draws.device)
-        return liu_west(self.process, cloud, ancestors, draws, self.shrink, floor)
+        return liu_west(self.process, cloud, ancestors, draws, self.shrinkage, floor)
 
-    def buried(
+    def gathered(
         self, particles: Float32[Tensor, "B N M S"], weighed: Weighed
     ) -> Float32[Tensor, "B N M S"]:
         """Dead particles all at the mean, whatever they were."""

@@ -10,10 +10,10 @@ from torch import Tensor
 from agents.particle import particle_count
 from agents.particle.belief import Step, normal
 from agents.particle.cloud import effective_sample_size, moments, normalized
-from agents.particle.resampling import RESAMPLE, Renewal
+from agents.particle.resampling import RESAMPLE, Resampling
 from coloc_env import noise
 
-# What a step says of particles, given their log-weights (the heaviest is where it is linearized).
+# Log-likelihoods of particles, given their log-weights (linearized at the heaviest).
 Evidence = Callable[
     [Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]], Float32[Tensor, "B N M"]
 ]
@@ -50,7 +50,7 @@ def tempered(
     gain: Float32[Tensor, "B N M"],
     staged: Bool[Tensor, "B N"],
     evidence: Evidence,
-    renewal: Renewal,
+    resampling: Resampling,
     now: Step,
 ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
     """The evidence in stages for some UAVs, w ← w exp(β gain) with Σβ = 1 and a resampling move
@@ -71,9 +71,9 @@ def tempered(
             break
         weights = log_weights.exp()
         key = noise.fold(now.key, stage)
-        draws = normal(key, "pf.move", renewal.process.error_size, weights.shape[-1])
-        cloud = moments(renewal.process, particles, weights)
-        moved = renewal.resample(cloud, weights, count, draws, key)
+        draws = normal(key, "pf.move", resampling.process.error_size, weights.shape[-1])
+        cloud = moments(resampling.process, particles, weights)
+        moved = resampling.resample(cloud, weights, count, draws, key)
         particles = torch.where(go_on[..., None, None], moved, particles)
         log_weights = torch.where(go_on.unsqueeze(-1), equal, log_weights)
         gain = evidence(particles, log_weights)

@@ -25,7 +25,7 @@ Test = Sequence[Float[Tensor, "B N m"] | None]  # weights for each block, None f
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the hard tests say of a step: weights of 0 or 1, the running share of each model's
+    """Outcome of a step's hard tests: weights of 0 or 1, the running share of each model's
     measurements that they would leave out, and where the gate has to look again at the end."""
 
     weights: list[Float[Tensor, "B N m"]]
@@ -40,16 +40,14 @@ class RobustScreen(Screen):
     per step, and a measurement stays if it passes all of them. Where the prior is broad, passing
     the ``gate`` (χ² quantile ``probability``) means little; there it judges again at the last
     iteration, by the residuals that are left. Where the tests go on leaving out most of what a
-    sensor says, it is the prediction that is wrong: then all of it passes, or a UAV that once went
-    astray could never return.
+    sensor measures, it is the prediction that is wrong: then all of it passes, or a UAV that once
+    went astray could never return.
     """
 
     def __init__(
         self, process: Process, models: Sequence[Measurement], robust: str, probability: float
     ) -> None:
         super().__init__(process, models)
-        if not 0 < probability < 1:
-            raise ValueError(f"gate={probability} is not allowed: a probability in (0, 1)")
         self.methods = _parsed(robust)
         self.probability = probability
         self.judges = bool(self.methods)

@@ -29,7 +29,7 @@ class CrossValidation:
     Landmark m puts UAV i at q_im = L_m − R_i z_im (its attitude being known best of all), and
     ‖q_im − q_jm‖ has to be r within what the three measurements leave open. Where a UAV thinks it
     is enters only through that: the attitude counts by how far the landmark should be. Every UAV
-    tells those that hear it where the landmarks put it.
+    sends its neighbours where the landmarks put it.
     """
 
     def __init__(self, process: Process, models: Sequence[Measurement]) -> None:
@@ -52,7 +52,7 @@ class CrossValidation:
             block = as_vectors(block)
         place, variance = self._places(block, prediction)
         observation = prediction.observation
-        theirs = _heard(torch.cat((place, variance, block.mask.unsqueeze(-1)), -1), observation)
+        theirs = _received(torch.cat((place, variance, block.mask.unsqueeze(-1)), -1), observation)
         distance, reached, noise = _distances(self.models[ranged], observation)
         apart = torch.linalg.vector_norm(place.unsqueeze(2) - theirs[..., :-2], dim=-1)
         error = apart.unsqueeze(2) - distance.unsqueeze(-1)  # [B, N, D, S, m]
@@ -93,21 +93,24 @@ def _distances(
     links = (observation["links"] > 0).unsqueeze(2)
     by_slot = (-1, links.shape[-1])
     if isinstance(model, UavRanges):
-        distance, mask, variance = observation["ranges"], "range_mask", model.variance
+        (distance, mask), variance = model.read(observation), model.variance
     else:
         assert isinstance(model, UavRangeBearings)
-        distance, mask = observation["uav_bearings"][..., ::2], "uav_bearing_mask"
+        z, mask = model.read(observation)
+        distance = z[..., 0]
         variance = model.std[0] ** 2
-    reached = (observation[mask] > 0).unflatten(-1, by_slot) & links
+    reached = mask.unflatten(-1, by_slot) & links
     return distance.double().unflatten(-1, by_slot), reached, variance
 
 
-def _heard(told: Float[Tensor, "B N m c"], observation: Observation) -> Float[Tensor, "B N S m c"]:
-    """What the UAVs in each UAV's slots tell (whether it arrives, ``links`` say)."""
+def _received(
+    sent: Float[Tensor, "B N m c"], observation: Observation
+) -> Float[Tensor, "B N S m c"]:
+    """What the UAVs in each UAV's slots send (``links``: whether it arrives)."""
     if "neighbours" not in observation:
-        return told.unsqueeze(1).expand(-1, told.shape[1], -1, -1, -1)
-    world = torch.arange(len(told), device=told.device)[:, None, None]
-    return told[world, observation["neighbours"].long()]
+        return sent.unsqueeze(1).expand(-1, sent.shape[1], -1, -1, -1)
+    world = torch.arange(len(sent), device=sent.device)[:, None, None]
+    return sent[world, observation["neighbours"].long()]
 
 
 def _stays(votes: Int64[Tensor, "*s"], against: Int64[Tensor, "*s"]) -> Bool[Tensor, "*s"]:

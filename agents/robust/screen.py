@@ -1,7 +1,6 @@
 """Screens: how far each measurement of a step is to be trusted, decided while an update iterates.
 
-Every filter works through one of these; a screen looks at blocks, never at a sensor's leaf or at
-the truth.
+Every filter works through one of these; a screen sees blocks, never a sensor's leaf or the truth.
 """
 
 from abc import ABC, abstractmethod
@@ -57,7 +56,7 @@ class Prediction:
 class Screen(ABC):
     """Judges the blocks of some measurement models.
 
-    ``judges``: it may trust a measurement less than another. ``exchanges``: it looks at what linked
+    ``judges``: it may trust a measurement less than another. ``exchanges``: it uses what linked
     neighbours measured, so that one localizer must act for the whole team. ``extra``: more
     iterations that it wants where the prior is broad.
     """

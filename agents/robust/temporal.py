@@ -1,4 +1,4 @@
-"""Temporal consistency: what a measurement says now against what it said in the last two frames."""
+"""Temporal consistency: a measurement now against the same one in the last two frames."""
 
 from collections.abc import Sequence
 

@@ -41,7 +41,8 @@ class TopologicalAttention(nn.Module):
 
     Equation 28: α_ij = softmax_j LeakyReLU(aᵀ [W h_i ‖ W h_j ‖ w_v ‖Δv_ij‖ ‖ c_ij]).
 
-    Equation 29: h_i' = z ⊙ h_i + (1 − z) ⊙ Σ_j α_ij W h_j, z = σ(W_z [h_i ‖ Σ_j α_ij W h_j] + b).
+    Equation 29: h_i' = z ⊙ h_i + (1 − z) ⊙ Σ_j α_ij W h_j, z = σ(W_z [h_i ‖ Σ_j α_ij W h_j] + b);
+    the sum goes through a swish where it is added.
 
     Links with a large relative speed ‖Δv_ij‖ and a low confidence c_ij are cut. Vectors of
     neighbours are averaged by α, and pushed through ranges, H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j.
@@ -127,5 +128,5 @@ class DilatedConvolution(nn.Module):
 
 
 def push(past: Float[Tensor, "B N K *r"], new: Float[Tensor, "B N *r"]) -> Tensor:
-    """``past`` with the newest in front and the oldest gone."""
+    """``past`` with ``new`` in front and without the oldest."""
     return torch.cat((new.unsqueeze(2), past[:, :, :-1]), 2)

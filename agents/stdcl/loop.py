@@ -126,8 +126,8 @@ class NetworkLoop(Localizer[LoopBelief]):
     def mean(self, belief: LoopBelief) -> Float64[Tensor, "B N S"]:
         return self.base.mean(belief.base)
 
-    def moved(self, belief: LoopBelief, offset: Float64[Tensor, "B N d"]) -> LoopBelief:
-        return belief.replace(base=self.base.moved(belief.base, offset))
+    def shifted(self, belief: LoopBelief, offset: Float64[Tensor, "B N d"]) -> LoopBelief:
+        return belief.replace(base=self.base.shifted(belief.base, offset))
 
     def diagnostics(self, belief: LoopBelief) -> dict[str, Float64[Tensor, "B N"]]:
         return self.base.diagnostics(belief.base)

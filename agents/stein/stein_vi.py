@@ -16,7 +16,7 @@ from torch import Tensor
 from agents.kalman.filter import gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models import preintegration
-from agents.models.measurements import Block, LandmarkVectors, nobody
+from agents.models.measurements import Block, LandmarkVectors, no_neighbours
 from agents.models.preintegration import Preintegrated
 from agents.models.process import InertialProcess
 from agents.particle.belief import normal, own_keys
@@ -203,7 +203,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
 
     def _block(self, x: Float64[Tensor, "*s 16"], observation: Observation) -> Block:
         """Residuals of the landmarks and their derivatives by the pose's error alone."""
-        block = self.model.linearize(self.process, x, observation, nobody(x[..., :3]))
+        block = self.model.linearize(self.process, x, observation, no_neighbours(x[..., :3]))
         return replace(block, jacobian=block.jacobian[..., _POSE])
 
     def _fit_landmarks(self, block: Block, variance: Float64[Tensor, "*s L"]) -> LandmarkFit:

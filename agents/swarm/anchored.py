@@ -140,7 +140,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
     def mean(self, belief: AnchoredBelief) -> Float64[Tensor, "B N S"]:
         return belief.state
 
-    def moved(self, belief: AnchoredBelief, offset: Float64[Tensor, "B N d"]) -> AnchoredBelief:
+    def shifted(self, belief: AnchoredBelief, offset: Float64[Tensor, "B N d"]) -> AnchoredBelief:
         d, state = self.process.dim, belief.state
         position = state[..., :d] + offset
         return belief.replace(state=torch.cat((position, state[..., d:]), -1))

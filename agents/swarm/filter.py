@@ -187,7 +187,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
     def mean(self, belief: SwarmBelief) -> Float64[Tensor, "B N S"]:
         return belief.state
 
-    def moved(self, belief: SwarmBelief, offset: Float64[Tensor, "B N d"]) -> SwarmBelief:
+    def shifted(self, belief: SwarmBelief, offset: Float64[Tensor, "B N d"]) -> SwarmBelief:
         d, state = self.process.dim, belief.state
         position = state[..., :d] + offset
         return belief.replace(state=torch.cat((position, state[..., d:]), -1))

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from agents.models.measurements import Measurement, nobody
+from agents.models.measurements import Measurement, no_neighbours
 from agents.models.measurements.vectors import Heights, Slowness
 from agents.models.process import Process
 from agents.models.update import information, posterior
@@ -43,7 +43,7 @@ class NavigationFilter:
         state, covariance = self.process.propagate(state, u, dt), f @ covariance @ f.mT + q
         if not self.models:
             return state, covariance
-        around = nobody(state[..., : self.process.dim])
+        around = no_neighbours(state[..., : self.process.dim])
         blocks = [m.linearize(self.process, state, observation, around) for m in self.models]
         precision, vector = information(blocks, [Trust()] * len(blocks))
         delta, covariance = posterior(covariance, precision, vector)

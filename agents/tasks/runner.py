@@ -14,7 +14,7 @@ from coloc_env.world import World
 
 @dataclass(frozen=True)
 class TaskStep:
-    """What was ``seen``, the ``action`` and its ``reward`` [B, n]; the ``world`` and ``memory`` after
+    """What was ``seen``, the ``action`` and its ``reward`` [B, n]; ``world`` and ``memory`` after
     the step, and the ``error`` [B, N] (m) there."""
 
     reward: Float32[Tensor, "B n"]

@@ -5,6 +5,7 @@ from typing import Any
 from agents.kalman.ekf import CooperativeEkf
 from agents.trust.network import TrustNetwork
 from agents.trust.screen import TrustScreen, learned_screen
+from coloc_env.options import PositiveCount
 from coloc_env.scenario import Believed
 
 
@@ -22,7 +23,7 @@ class TrustingEkf(CooperativeEkf):
         believed: Believed,
         *,
         weights: str = "trust",
-        iterations: int = 3,
+        iterations: PositiveCount = 3,
         **options: Any,
     ) -> None:
         super().__init__(believed, iterations=iterations, **options)

@@ -1,4 +1,4 @@
-"""What the trust networks are told of each measurement: dimensionless, the same for any team.
+"""What the trust networks are fed for each measurement: dimensionless, the same for any team.
 
 Every feature is a pure function of a UAV's own blocks, prior and memory; see ``network.SHARED`` and
 ``network.SIGNED`` for their order and meaning.
@@ -67,7 +67,7 @@ def features(
     """``SHARED`` and ``SIGNED`` features of a block whose residuals are those after a Huber update.
 
     ``own_std``: log of the position's prior standard deviation; ``counts``: log(1 + number) of
-    vector measurements and of ranges seen, and of the former lately.
+    vector measurements and of ranges seen, and the running mean of the former.
     """
     r, noise = block.residual, block.total_variance
     scaled = r / noise.sqrt()
@@ -128,6 +128,8 @@ def remembered(memory: Float[Tensor, "B N m 3"], first: Innovation) -> Float[Ten
     return memory + rate * (now - memory)
 
 
-def lately(before: Float[Tensor, "B N 1"], vectors: Float[Tensor, "B N"]) -> Float[Tensor, "B N 1"]:
+def running_count(
+    before: Float[Tensor, "B N 1"], vectors: Float[Tensor, "B N"]
+) -> Float[Tensor, "B N 1"]:
     """Running mean of log(1 + number) of vector measurements."""
     return before + _SLOW * (vectors.unsqueeze(-1) - before)

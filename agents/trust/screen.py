@@ -25,9 +25,9 @@ from agents.trust.features import (
     Innovation,
     features,
     innovation,
-    lately,
     log_std,
     remembered,
+    running_count,
 )
 from agents.trust.network import SHARED, TrustNetwork
 from agents.weights import learned
@@ -39,7 +39,7 @@ _VECTORS = (LandmarkVectors, LandmarkRangeBearings, UavRangeBearings)
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the prior says of the blocks that are judged: innovations, the links' memory, log of the
+    """The judged blocks at the prior: innovations, the links' memory, log of the
     position's standard deviation, log(1 + number) of vector measurements and ranges seen, and the
     running mean of the former."""
 
@@ -47,7 +47,7 @@ class Evidence:
     memory: list[Float[Tensor, "B N m 3"]]
     own_std: Float[Tensor, "B N"]
     counts: list[Float[Tensor, "B N"]]
-    lately: Float[Tensor, "B N 1"]
+    running_count: Float[Tensor, "B N 1"]
 
 
 class TrustScreen(Screen):
@@ -86,13 +86,13 @@ class TrustScreen(Screen):
         for i, one in zip(self.judged, first, strict=True):
             totals[int(i in self.ranges)] += one.seen.sum(-1)
         counts = list(totals.log1p())
-        now = lately(before, counts[0])
+        now = running_count(before, counts[0])
         return Evidence(
             first=first,
             memory=[part.unflatten(-1, (-1, MEMORY)) for part in parts],
             own_std=log_std(prediction, self.process.dim),
             counts=[*counts, now[..., 0]],
-            lately=now,
+            running_count=now,
         )
 
     def weigh(self, blocks: Sequence[Block], evidence: Evidence, last: bool) -> list[Trust]:
@@ -102,7 +102,7 @@ class TrustScreen(Screen):
         for i, first, memory in zip(self.judged, evidence.first, evidence.memory, strict=True):
             block = blocks[i]
             seen = features(block, first, evidence.own_std, evidence.counts, memory)
-            # What stands behind a mask may be anything; the networks must not see it.
+            # Behind a mask may be anything; the networks must not see it.
             seen = seen.detach().to(torch.float32).masked_fill(~block.mask.unsqueeze(-1), 0.0)
             if i in self.ranges:
                 weight, bias = self.network.trust_ranges(seen)
@@ -120,7 +120,7 @@ class TrustScreen(Screen):
             remembered(memory, first).flatten(-2)
             for memory, first in zip(evidence.memory, evidence.first, strict=True)
         ]
-        return torch.cat((evidence.lately, *parts), -1).to(prediction.memory.dtype)
+        return torch.cat((evidence.running_count, *parts), -1).to(prediction.memory.dtype)
 
 
 def learned_screen(

@@ -8,7 +8,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.localizer import Localizer
-from agents.models.measurements import heard, make_measurements
+from agents.models.measurements import make_measurements, received
 from agents.models.measurements.bearings import UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights
@@ -62,7 +62,7 @@ class Correction(ActionMode):
             raise ValueError(f"feedback={feedback} is not allowed: a share in [0, 1]")
         self.base: Localizer[Any] = make(base, believed)
         kind = type(self.base)
-        if feedback and kind.moved is Localizer.moved:
+        if feedback and kind.shifted is Localizer.shifted:
             raise ValueError(
                 f"base={base!r} with feedback={feedback} is not allowed: it cannot be moved; "
                 "feedback=0, or a filter such as ekf or pf500"
@@ -91,11 +91,11 @@ class Correction(ActionMode):
         vectors = 3 * bool(self._fixes) + 2 * bool(self.models) + 1
         attitude = {"attitude": Leaf(self.process.attitude_size)} if self._fixes else {}
         return {
-            "base_estimate": Leaf(3 * d),
-            "base_std": Leaf(d, 0.0),
+            "base_estimate": Leaf(3 * d, unit="m, m/s, log m", frame="world"),
+            "base_std": Leaf(d, 0.0, unit="m", frame="world"),
             **attitude,
             **self._fixes,
-            "residuals": Leaf(vectors * d),
+            "residuals": Leaf(vectors * d, unit="m", frame="world"),
             "last_action": Leaf(d, -1.0, 1.0),
         }
 
@@ -125,7 +125,7 @@ class Correction(ActionMode):
         state = self.base.mean(belief) if self.models or self._fixes else None
         if self.models:
             assert state is not None
-            x, neighbours = state.double(), heard(self.believed, observation)
+            x, neighbours = state.double(), received(self.believed, observation)
             blocks = [m.linearize(self.process, x, observation, neighbours) for m in self.models]
             raw, clipped = (pull.to(torch.float32) for pull in pulls(blocks, d))
             residuals, robust = [raw, clipped], clipped
@@ -149,7 +149,7 @@ class Correction(ActionMode):
         offset = memory.scale * action
         belief = memory.belief
         if self.feedback:
-            belief = self.base.moved(belief, self.feedback * offset)
+            belief = self.base.shifted(belief, self.feedback * offset)
         estimate = memory.estimate
         corrected = torch.cat((estimate[..., :d] + offset, estimate[..., d:]), -1)
         return memory.replace(belief=belief, last_action=action), corrected

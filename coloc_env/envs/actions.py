@@ -312,7 +312,7 @@ def checked_arrays(
     needed, for one that is not numeric, complex, of another shape, or holds NaN or infinity."""
     rows = _array([actions[agent] for agent in agents])
     if rows is not None and rows.shape == (len(agents), *mode.shape):
-        values = rows.astype(np.float32)
+        values = rows.astype(np.float32, copy=False)
         if np.count_nonzero(np.isfinite(values)) == values.size and _chosen(mode, values):
             return values
     return np.stack([_checked_array(scenario, mode, actions[agent], agent) for agent in agents])

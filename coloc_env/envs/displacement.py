@@ -44,7 +44,11 @@ class Displacement(ActionMode):
 
     @property
     def leaves(self) -> dict[str, Leaf]:
-        attitude = Leaf(4 if self.dim == 3 else 1)
+        attitude = (
+            Leaf(4, unit="quaternion", frame="world")
+            if self.dim == 3
+            else Leaf(1, unit="rad", frame="world")
+        )
         return {"attitude": attitude, **self._fixes, "last_action": Leaf(self.dim, -1.0, 1.0)}
 
     def reset(self, observation: Observation) -> DisplacementMemory:

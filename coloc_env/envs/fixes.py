@@ -16,9 +16,9 @@ def fix_leaves(believed: Believed) -> dict[str, Leaf]:
     if not slots:
         return {}
     return {
-        "landmark_fixes": Leaf(slots * dim),
+        "landmark_fixes": Leaf(slots * dim, unit="m", frame="world"),
         "landmark_fix_mask": Leaf(slots, *MASK),
-        "fix_mean": Leaf(dim),
+        "fix_mean": Leaf(dim, unit="m", frame="world"),
         "fix_share": Leaf(1, *MASK),
     }
 

@@ -18,11 +18,14 @@ MASK = (0.0, 1.0)
 
 @dataclass(frozen=True)
 class Leaf:
-    """One 1-D float32 entry of a UAV's observation: its width and the bounds of its Box."""
+    """One 1-D float32 entry of a UAV's observation: its width, the bounds of its Box, and, for
+    whoever reads it, the unit of its numbers and the frame that they are in."""
 
     width: int
     low: float = -float("inf")
     high: float = float("inf")
+    unit: str = ""
+    frame: str = ""
 
 
 @dataclass(frozen=True)

@@ -62,10 +62,13 @@ class LandmarkBearings(Sensor):
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 2, "LandmarkBearings", "dim", "bearings need a 2-D scenario")
         slots = self.depth * self.count
-        return {"landmark_bearings": Leaf(2 * slots), "landmark_bearing_mask": Leaf(slots, *MASK)}
+        return {
+            "landmark_bearings": Leaf(2 * slots, unit="m, rad", frame="body"),
+            "landmark_bearing_mask": Leaf(slots, *MASK),
+        }
 
     def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"landmark_map": Leaf(2 * self.count)}
+        return {"landmark_map": Leaf(2 * self.count, unit="m", frame="world")}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         return {"positions": uniform_points(keys, "bearings.place", self.count, layout)}
@@ -106,7 +109,10 @@ class UavBearings(Sensor):
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 2, "UavBearings", "dim", "bearings need a 2-D scenario")
         slots = self.depth * layout.slots
-        return {"uav_bearings": Leaf(2 * slots), "uav_bearing_mask": Leaf(slots, *MASK)}
+        return {
+            "uav_bearings": Leaf(2 * slots, unit="m, rad", frame="body"),
+            "uav_bearing_mask": Leaf(slots, *MASK),
+        }
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion, n, slots = window.motion, window.layout.arena.n_uavs, window.layout.slots

@@ -35,7 +35,7 @@ class Displacement(Sensor):
         require(self.blind >= 0, self, "blind", "a number of UAVs ≥ 0")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"displacement": Leaf(layout.arena.dim)}
+        return {"displacement": Leaf(layout.arena.dim, unit="m", frame="world")}
 
     def variance(self, distance: Float[Tensor, "*s N"]) -> Float[Tensor, "*s N"]:
         """Variance per axis (m²) of what is known of a step over some distance (m)."""

@@ -22,7 +22,7 @@ class Height(Sensor):
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 3, "Height", "dim", "a height needs a 3-D scenario")
-        return {"height": Leaf(1), "height_mask": Leaf(1, *MASK)}
+        return {"height": Leaf(1, unit="m", frame="world"), "height_mask": Leaf(1, *MASK)}
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         z = window.motion.position[..., 2:].to(torch.float32)

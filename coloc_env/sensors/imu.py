@@ -42,7 +42,7 @@ class Imu(Sensor):
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 3, "Imu", "dim", "an IMU needs a 3-D scenario")
-        return {"imu": Leaf(6)}
+        return {"imu": Leaf(6, unit="m/s², rad/s", frame="body")}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         if not (self.accel_bias or self.gyro_bias):
@@ -81,7 +81,12 @@ class RecordedImu(RecordedSensor):
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         more = {name: one.values.shape[-1] for name, one in self.series.items() if name != "imu"}
         lowest = {"imu_samples": -float("inf")}
-        own = {name: Leaf(width, lowest.get(name, 0.0)) for name, width in more.items()}
+        own = {
+            name: Leaf(width, lowest.get(name, 0.0), unit="m/s², rad/s", frame="body")
+            if name != "imu_held"
+            else Leaf(width, 0.0, unit="s")
+            for name, width in more.items()
+        }
         return super().leaves(layout) | own
 
 

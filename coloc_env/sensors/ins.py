@@ -45,7 +45,7 @@ class Ins(Sensor):
         require(self.bias_time > 0, self, "bias_time", "a time in s > 0")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"ins": Leaf(layout.arena.dim)}
+        return {"ins": Leaf(layout.arena.dim, unit="m/s", frame="world")}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         """``turn`` (rad per step) and ``phase`` (rad) of each cosine, [R, cosines, N, d]."""

@@ -68,12 +68,12 @@ class Landmarks(Sensor):
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return {
-            "landmarks": Leaf(self.count * layout.arena.dim),
+            "landmarks": Leaf(self.count * layout.arena.dim, unit="m", frame="body"),
             "landmark_mask": Leaf(self.count, *MASK),
         }
 
     def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"landmark_map": Leaf(self.count * layout.arena.dim)}
+        return {"landmark_map": Leaf(self.count * layout.arena.dim, unit="m", frame="world")}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         if self.positions is None:

@@ -43,7 +43,8 @@ class Odometry(Sensor):
         return cls(slip, slip, math.radians(noise[1]) / dt)
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"odometry": Leaf(6 if layout.arena.dim == 3 else 3)}
+        size = 6 if layout.arena.dim == 3 else 3
+        return {"odometry": Leaf(size, unit="m/s, rad/s", frame="body")}
 
     def std(self, odometry: Tensor) -> Tensor:
         """Standard deviations of a sample, as wide as it is; sideways slip follows the speed."""

@@ -24,7 +24,10 @@ class PositionFix(Sensor):
         require(self.count >= 1, self, "count", "at least one UAV (leave the sensor out for 0)")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"position_fix": Leaf(layout.arena.dim), "position_fix_mask": Leaf(1, *MASK)}
+        return {
+            "position_fix": Leaf(layout.arena.dim, unit="m", frame="world"),
+            "position_fix_mask": Leaf(1, *MASK),
+        }
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         position = window.motion.position.to(torch.float32)

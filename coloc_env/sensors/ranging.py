@@ -87,7 +87,7 @@ class Ranging(Sensor):
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         width = layout.slots * self.n_tags**2
-        return {"ranges": Leaf(width), "range_mask": Leaf(width, *MASK)}
+        return {"ranges": Leaf(width, unit="m"), "range_mask": Leaf(width, *MASK)}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         return {} if self.clock is None else self.clock.place(keys, layout.arena.n_uavs)
@@ -160,10 +160,10 @@ class AnchorRanging(Sensor):
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         width = len(self.anchors) * self.n_tags
-        return {"anchor_ranges": Leaf(width), "anchor_range_mask": Leaf(width, *MASK)}
+        return {"anchor_ranges": Leaf(width, unit="m"), "anchor_range_mask": Leaf(width, *MASK)}
 
     def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"anchor_map": Leaf(len(self.anchors) * layout.arena.dim)}
+        return {"anchor_map": Leaf(len(self.anchors) * layout.arena.dim, unit="m", frame="world")}
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         anchors = torch.tensor(self.anchors, dtype=torch.float64, device=keys.device)

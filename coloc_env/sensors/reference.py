@@ -24,7 +24,8 @@ class Reference(Sensor):
     informs = False
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"reference": Leaf(poses_in(layout.arena.dim).size)}
+        unit = "m, quaternion" if layout.arena.dim == 3 else "m, rad"
+        return {"reference": Leaf(poses_in(layout.arena.dim).size, unit=unit, frame="world")}
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion = window.motion

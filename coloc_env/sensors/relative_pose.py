@@ -44,7 +44,11 @@ class RelativePose(Sensor):
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         arena = layout.arena
         return {
-            "relative_poses": Leaf(self.matches * poses_in(arena.dim).size),
+            "relative_poses": Leaf(
+                self.matches * poses_in(arena.dim).size,
+                unit="m, quaternion" if arena.dim == 3 else "m, rad",
+                frame="body of the first",
+            ),
             "relative_pose_mask": Leaf(self.matches, *MASK),
             "relative_pose_ends": Leaf(2 * self.matches, 0.0, float(max(1, arena.n_uavs - 1))),
         }

@@ -53,8 +53,8 @@ def test_covariances_are_symmetric_and_positive(case: SimpleNamespace) -> None:
         assert (torch.linalg.eigvalsh(covariance) > 0).all()
 
 
-def test_the_action_says_what_the_estimate_says(case: SimpleNamespace) -> None:
-    estimate, d = case.run.estimates[-1], case.scenario.arena.dim
+def test_the_action_says_what_the_estimate_says(sample: SimpleNamespace) -> None:
+    estimate, d = sample.run.estimates[-1], sample.scenario.arena.dim
     position, velocity, log_std = estimate.action().double().split(d, -1)
     variance = estimate.covariance.diagonal(dim1=-2, dim2=-1).double()
     torch.testing.assert_close(position, estimate.position.double(), rtol=1e-6, atol=1e-5)
@@ -65,36 +65,36 @@ def test_the_action_says_what_the_estimate_says(case: SimpleNamespace) -> None:
 # ---------------------------------------------------------------- purity
 
 
-def test_step_is_pure(case: SimpleNamespace, tools: SimpleNamespace) -> None:
+def test_step_is_pure(sample: SimpleNamespace, tools: SimpleNamespace) -> None:
     k = 2
-    belief, observation = case.run.beliefs[k], case.run.observations[k]
+    belief, observation = sample.run.beliefs[k], sample.run.observations[k]
     kept_belief, kept = belief.clone(), copies(observation)
-    case.localizer.step(case.run.beliefs[-1], case.run.observations[-1])  # leaves no trace
-    after, estimate = case.localizer.step(belief, observation)
+    sample.localizer.step(sample.run.beliefs[-1], sample.run.observations[-1])  # leaves no trace
+    after, estimate = sample.localizer.step(belief, observation)
     tools.assert_same(belief, kept_belief)
     for name, leaf in kept.leaves.items():
         assert torch.equal(observation[name], leaf), name
-    tools.assert_same(after, case.run.beliefs[k + 1])
-    tools.assert_same(estimate, case.run.estimates[k])
+    tools.assert_same(after, sample.run.beliefs[k + 1])
+    tools.assert_same(estimate, sample.run.estimates[k])
 
 
-def test_reset_is_pure(case: SimpleNamespace, tools: SimpleNamespace) -> None:
-    observation = case.run.observations[0]
+def test_reset_is_pure(sample: SimpleNamespace, tools: SimpleNamespace) -> None:
+    observation = sample.run.observations[0]
     kept = copies(observation)
-    tools.assert_same(case.localizer.reset(observation), case.run.beliefs[0])
+    tools.assert_same(sample.localizer.reset(observation), sample.run.beliefs[0])
     assert all(torch.equal(observation[name], leaf) for name, leaf in kept.leaves.items())
 
 
-def test_a_run_can_be_repeated(case: SimpleNamespace, tools: SimpleNamespace) -> None:
-    again = tools.play(tools.build(case.name, case.scenario), case.scenario, (3, 4), 4)
-    for one, other in zip(again.estimates, case.run.estimates, strict=True):
+def test_a_run_can_be_repeated(sample: SimpleNamespace, tools: SimpleNamespace) -> None:
+    again = tools.play(tools.build(sample.name, sample.scenario), sample.scenario, (3, 4), 4)
+    for one, other in zip(again.estimates, sample.run.estimates, strict=True):
         tools.assert_same(one, other)
-    tools.assert_same(again.beliefs[-1], case.run.beliefs[-1])
+    tools.assert_same(again.beliefs[-1], sample.run.beliefs[-1])
 
 
-def test_steps_do_not_touch_the_global_generator(case: SimpleNamespace) -> None:
+def test_steps_do_not_touch_the_global_generator(sample: SimpleNamespace) -> None:
     before = torch.get_rng_state()
-    case.localizer.step(case.run.beliefs[0], case.run.observations[0])
+    sample.localizer.step(sample.run.beliefs[0], sample.run.observations[0])
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -115,9 +115,9 @@ def test_rows_do_not_depend_on_how_many_there_are(name: str, tools: SimpleNamesp
     scenario = tools.room(name)
     localizer = tools.build(name, scenario)
     tolerance = SUMMED if localizer.centralized else EXACT
-    many = tools.play(localizer, scenario, range(70), 4)
-    for seed in (0, 40, 69):
-        alone = tools.play(localizer, scenario, [seed], 4)
+    many = tools.play(localizer, scenario, range(70), 3)
+    for seed in (0, 69):
+        alone = tools.play(localizer, scenario, [seed], 3)
         tools.assert_same(alone.beliefs[-1], many.beliefs[-1][seed : seed + 1], tolerance)
 
 
@@ -131,7 +131,7 @@ def test_a_row_of_a_small_team_is_its_own_run(
     localizer = tools.build(name, scenario)
     tolerance = SUMMED if localizer.centralized else EXACT
     many = tools.play(localizer, scenario, range(3), 4)
-    for seed in range(3):
+    for seed in (0, 2):
         alone = tools.play(localizer, scenario, [seed], 4)
         for one, other in zip(alone.estimates, many.estimates, strict=True):
             tools.assert_same(one, other[seed : seed + 1], tolerance)

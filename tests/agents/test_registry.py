@@ -2,9 +2,11 @@
 
 import importlib
 import inspect
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
+from torch import Tensor
 
 from agents import LOCALIZERS, Localizer, make
 from agents.kalman.ekf import CooperativeEkf
@@ -12,6 +14,8 @@ from agents.robust import RobustScreen
 from coloc_env.registry import Registry
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.scenarios import make_scenario
+from coloc_env.sensors import Sensor
+from coloc_env.sensors.base import Layout, Leaf, Window
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +59,9 @@ REFUSALS = {
     ],
     "ekf:iterations=two": ["ekf", "iterations='two'", "a whole number"],
     "ekf:iterations=2.5": ["ekf", "iterations='2.5'", "a whole number"],
-    "ekf:iterations=0": ["ekf", "iterations=0", "at least 1"],
-    "ekf:iterations=-3": ["ekf", "iterations=-3", "at least 1"],
-    "ekf:gate=1": ["ekf", "gate=1.0", "(0, 1)"],
+    "ekf:iterations=0": ["ekf", "iterations='0'", "a whole number ≥ 1"],
+    "ekf:iterations=-3": ["ekf", "iterations='-3'", "a whole number ≥ 1"],
+    "ekf:gate=1": ["ekf", "gate='1'", "a number > 0 and < 1"],
     "ekf:gate=nan": ["ekf", "gate='nan'", "a number"],
     "ekf:cooperate=perhaps": ["ekf", "cooperate='perhaps'", "true or false"],
     "ekf:fusion=CI": ["ekf", "fusion='CI'", "one of naive, ci"],
@@ -73,11 +77,23 @@ REFUSALS = {
     "ekf:robust=huber=gate": ["ekf", "robust='huber=gate'"],
     "ekf:robust=huber:robust=gate": ["ekf", "robust", "twice"],
     "dead_reckoning:robust=huber": ["dead_reckoning", "unknown option 'robust'", "none"],
-    "ekf_joint:gate=0": ["ekf_joint", "gate=0.0", "(0, 1)"],
-    "ekf_joint:iterations=0": ["ekf_joint", "iterations=0", "at least 1"],
-    "pf800:particles=9": ["pf800", "particles=9", "at least 10"],
+    "ekf_joint:gate=0": ["ekf_joint", "gate='0'", "a number > 0 and < 1"],
+    "ekf_joint:iterations=0": ["ekf_joint", "iterations='0'", "a whole number ≥ 1"],
+    "pf800:particles=9": ["pf800", "particles='9'", "a whole number from 10 to 100000"],
     "pf500:perturb=liuwest": ["pf500", "perturb='liuwest'", "one of liu_west, fixed"],
     "pf500:seed=1e3": ["pf500", "seed='1e3'", "a whole number"],
+    "pf500:seed=-1": ["pf500", "seed='-1'", "a whole number ≥ 0"],
+    "pf500:particles=1000000000": ["pf500", "particles=", "from 10 to 100000"],
+    "apf:bounds=5,400": ["apf", "bounds=", "from 10 to 100000"],
+    "apf:bounds=400,500": ["apf", "bounds=(400, 500)", "low ≤ particles (300) ≤ high"],
+    "pfnn:correction=0,1": ["pfnn", "correction=", "> 0"],
+    "pfnn:correction=0.9,0.5": ["pfnn", "correction=(0.9, 0.5)", "low ≤ high"],
+    "ekf_trust:iterations=0": ["ekf_trust", "iterations='0'", "a whole number ≥ 1"],
+    "emvf:memory=1": ["emvf", "memory='1'", "from 2 to 1000 in steps"],
+    "hpff:quantile=1": ["hpff", "quantile='1'", "a number > 0 and < 1"],
+    "hpff:quantile=1.5": ["hpff", "quantile='1.5'", "a number > 0 and < 1"],
+    "hpff:patience=0": ["hpff", "patience='0'", "a whole number ≥ 1"],
+    "nnhpff:threshold=-0.1": ["nnhpff", "threshold='-0.1'", "from 0 to 1"],
 }
 
 
@@ -173,11 +189,52 @@ IGNORED = {  # a localizer, a scenario, and what it would ignore of it
     "dwmds_st indoors": ("dwmds_st", "indoor-v0", {}, "Landmarks"),
     "ekf among relative poses": ("ekf", "stein2d-v0", {}, "RelativePose"),
     "cspf in a swarm": ("cspf", "swarm-v0", {}, "PositionFix, Ranging"),
+    "emvf by ranges between UAVs": ("emvf", "indoor-v0", {"landmarks": 0}, "Ranging"),
+    "a hybrid of what ignores it": ("hpff:main=map", "indoor-v0", {"anchors": 4}, "Landmarks"),
 }
 
 
 @pytest.mark.parametrize("case", IGNORED)
 def test_a_localizer_refuses_to_ignore_what_is_measured(case: str) -> None:
     name, scenario, overrides, sensors = IGNORED[case]
-    with pytest.raises(ValueError, match=rf"^{name}: .*{sensors} would be ignored; these use it: "):
+    owner = name.split(":")[0]
+    words = rf"^{owner}: .*{sensors} would be ignored; these use it: "
+    with pytest.raises(ValueError, match=words):
         make(name, make_scenario(scenario, **overrides))
+
+
+def test_nothing_to_estimate_from_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^emvf: the team measures nothing of its own"):
+        make("emvf", make_scenario("indoor-v0", landmarks=0, uwb=False))
+
+
+@dataclass(frozen=True)
+class Barometer(Sensor):
+    """A sensor that nobody has a measurement model for."""
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        return {}
+
+    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {}
+
+
+class Sonar(Barometer):
+    """Another."""
+
+
+def test_a_sensor_without_a_model_is_named_once(
+    scenario: Scenario, recwarn: pytest.WarningsRecorder
+) -> None:
+    def with_sensor(sensor: Sensor) -> Believed:
+        believed = scenario.believed
+        return replace(believed, sensors=(*believed.sensors, sensor))
+
+    for name in ("ekf", "ekf", "pf500"):
+        make(name, with_sensor(Barometer()))
+    make("ekf", with_sensor(Sonar()))
+    words = [str(w.message) for w in recwarn if issubclass(w.category, UserWarning)]
+    assert [w.split()[0] for w in words] == ["Barometer", "Sonar"]
+    assert all("has no measurement model" in w for w in words)
+    with pytest.raises(ValueError, match=r"^map: .*Landmarks, Barometer would be ignored"):
+        make("map", with_sensor(Barometer()))

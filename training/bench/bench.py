@@ -37,7 +37,7 @@ _RATIOS = {  # ours to theirs, six agents each
     "World / VMAS, B=32": ("World B=32", "VMAS simple_spread B=32"),
     "World / VMAS, B=1024": ("World B=1024", "VMAS simple_spread B=1024"),
 }
-_PACKAGES = ("coloc", "torch", "tensordict", "torchrl", "pettingzoo", "mpe2", "vmas")
+_PACKAGES = ("coloc-env", "torch", "tensordict", "torchrl", "pettingzoo", "mpe2", "vmas")
 _MEMORY = """
 import torch
 from coloc_env.scenarios import make_scenario

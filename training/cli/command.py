@@ -75,7 +75,7 @@ for _command in (
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"coloc {version('coloc')}")
+        typer.echo(f"coloc {version('coloc-env')}")
         raise typer.Exit
 
 

@@ -43,7 +43,7 @@ _FIELDS = {
 }
 _OPTIONAL = {"versions": dict[str, str]}
 _UNBOUNDED = 1 << 62  # frames: the epochs end a training, not a number of frames
-_VERSIONS = ("coloc", "torch", "torchrl", "tensordict", "safetensors", "numpy")
+_VERSIONS = ("coloc-env", "torch", "torchrl", "tensordict", "safetensors", "numpy")
 
 
 class CountsEpochs(Protocol):

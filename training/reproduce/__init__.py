@@ -1,6 +1,6 @@
-"""``coloc reproduce``: a paper's experiments run anew, its figures beside ours, and what holds.
+"""``coloc reproduce``: a paper's experiments, its figures beside ours, and what holds.
 
-General are the store of what has been computed (``store``, ``identity``), the work to be done
-(``study``, ``pool``), its cost (``cost``), and how claims are decided (``verdicts``). What is one
-paper's own lies in a package of its own: its numbers, its plan, its tables, figures and claims.
+A study is data: a plan of cells, measures, claims and goals, tables, figures (``study``). One
+machine computes what its store lacks (``work``, ``pool``, ``store``, ``identity``), decides what
+holds (``verdicts``), and writes the results and their page (``page``).
 """

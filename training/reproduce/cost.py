@@ -22,8 +22,8 @@ from coloc_env.scenario import Scenario
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
 from training.evaluation.rollout import Breakdown, rollout
-from training.reproduce.store import Store
-from training.reproduce.study import Piece, Variant
+from training.reproduce.store import Arrays, Facts
+from training.reproduce.work import Kind, Piece, Variant
 
 MEMORY = """\
 Memory, measured: *belief* is what the team carries from step to step; *working set* is the most
@@ -40,54 +40,68 @@ class Cost:
     belief: int
     working: int
 
+    @property
+    def held(self) -> int:
+        """Bytes in all."""
+        return self.belief + self.working
+
+    @property
+    def median(self) -> float:
+        """Of the steps' times, ms."""
+        return float(np.median(self.ms))
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """As plain values."""
+        return {
+            "ms_per_step": float(self.ms.mean()),
+            "ms_per_step_std": float(self.ms.std()),
+            "ms_per_step_median": self.median,
+            "belief_bytes": self.belief,
+            "working_set_bytes": self.working,
+        }
+
 
 @torch.no_grad()
 def measure(
-    scenario: Scenario, agents: Sequence[str], seed: int, tell: Progress
+    scenario: Scenario, agents: Sequence[str], seed: int, progress: Progress
 ) -> dict[str, Cost]:
     """Cost of each agent over a run; an agent that raises a numerical error has none."""
     teams = {name: _Team(make(name, scenario), scenario, seed) for name in agents}
     ms: dict[str, list[float]] = {name: [] for name in agents}
+    warm_up = min(_WARM_UP, scenario.horizon)
     with _one_thread():
-        for k in range(_WARM_UP + scenario.horizon):
+        for k in range(warm_up + scenario.horizon):
             for name, team in list(teams.items()):
-                if k in (0, _WARM_UP):
+                if k in (0, warm_up):
                     team.start()
                 try:
                     spent = team.step()
                 except Breakdown:
                     del teams[name]
                     continue
-                if k >= _WARM_UP:
+                if k >= warm_up:
                     ms[name].append(spent)
-            tell("cost", k + 1, _WARM_UP + scenario.horizon)
+            progress("cost", k + 1, warm_up + scenario.horizon)
         return {
             name: Cost(np.array(ms[name]), team.last.belief.bytes(), _peak(team))
             for name, team in teams.items()
         }
 
 
-def measured(
-    store: Store,
-    variant: Variant,
-    seed: int,
-    agents: Sequence[str],
-    tell: Progress,
-    missing: bool = True,
-) -> dict[str, Cost]:
-    """The cost of agents, from the store if it is there; ``missing=False`` measures nothing."""
-    if not agents:
-        return {}
-    name = f"{variant.key}/cost-{seed}"
-    settings = {"cost": [Piece(variant, agent, seed, 1).settings() for agent in agents]}
-    if not store.has(name, settings):
-        if not missing:
-            return {}
-        found = measure(variant.build(), agents, seed, tell)
-        facts = {agent: [one.belief, one.working] for agent, one in found.items()}
-        store.save(name, settings, {agent: one.ms for agent, one in found.items()}, facts)
-    arrays, facts = store.load(name, settings)
+def compute(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+    """``measure`` the agents of a piece."""
+    found = measure(piece.variant.build(), piece.agents, piece.seed, progress)
+    facts = {agent: [one.belief, one.working] for agent, one in found.items()}
+    return {agent: one.ms for agent, one in found.items()}, facts
+
+
+def load(variant: Variant, arrays: Arrays, facts: Facts) -> dict[str, Cost]:
+    """What ``compute`` found, by agent."""
     return {agent: Cost(arrays[agent], *facts[agent]) for agent in facts}
+
+
+COST = Kind("cost", f"{__name__}:compute", f"{__name__}:load", together=True)
 
 
 class _Team:
@@ -106,8 +120,8 @@ class _Team:
 
 
 def _peak(team: _Team) -> int:
-    """Bytes allocated at the height of a step, as torch's profiler tells it."""
-    with tempfile.TemporaryDirectory() as folder, _no_chatter():
+    """Bytes allocated at the height of a step, as torch's profiler counts them."""
+    with tempfile.TemporaryDirectory() as folder, _silenced():
         with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
             team.localizer.step(team.last.belief, team.last.observation)
         trace = Path(folder) / "trace.json"
@@ -120,8 +134,8 @@ def _peak(team: _Team) -> int:
 
 
 @contextmanager
-def _no_chatter() -> Iterator[None]:
-    """The profiler writes about itself to stderr, past Python: away with that."""
+def _silenced() -> Iterator[None]:
+    """The profiler writes about itself to stderr, past Python: not here."""
     kept = os.dup(2)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)

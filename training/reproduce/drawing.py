@@ -1,38 +1,34 @@
-"""What figures of reports have in common."""
+"""What figures of studies have in common."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from training.evaluation.figures import STYLE
+from training.evaluation.metrics import Floats
+from training.reproduce.results import Results
+
+Drawing = Callable[[Results], Figure | None]  # its docstring is the caption; None: nothing to draw
+# Colours that all eyes distinguish.
+PALETTE = ("#CC79A7", "#56B4E9", "#882255", "#7F7F1F", "#332288", "#AA4499", "#999999", "#44AA99")
 
 
-def save(drawing: Callable[[], Figure], file: Path) -> None:
-    """Draw in the house's style and write a PNG that cuts nothing off."""
+def draw(drawing: Drawing, results: Results, file: Path) -> str | None:
+    """Write a PNG that cuts nothing off; the caption, or None if there was nothing to draw."""
     with mpl.rc_context(STYLE):
-        figure = drawing()
+        figure = drawing(results)
+        if figure is None:
+            return None
         page = Bbox.union([figure.bbox_inches, figure.get_tightbbox()])
         figure.savefig(file, dpi=150, bbox_inches=page)
-
-
-def caption(drawing: Callable[..., Figure]) -> str:
-    """A drawing's docstring, as what stands below it."""
     return " ".join((drawing.__doc__ or "").split())
-
-
-def draw(drawings: Mapping[str, Callable[[], Figure]], folder: Path) -> list[str]:
-    """Write figures; the lines that show them, each drawing's docstring as its caption."""
-    text: list[str] = []
-    for name, drawn in drawings.items():
-        save(drawn, folder / name)
-        words = caption(getattr(drawn, "func", drawn))
-        text += [f"![{words}]({name})", "", f"*{words}*", ""]
-    return text
 
 
 def headline(figure: Figure, title: str) -> None:
@@ -55,3 +51,19 @@ def panels(
     headline(figure, title)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
     return figure, [list(row) for row in grid]
+
+
+def legend(figure: Figure, axes: Sequence[Axes], columns: int = 5) -> None:
+    """One legend below all axes, each label once."""
+    handles: dict[str, Any] = {}
+    for each in axes:
+        for handle, label in zip(*each.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8.5
+    )
+
+
+def seconds(values: Floats, dt: float) -> Floats:
+    """Times of steps."""
+    return dt * np.arange(len(values))

@@ -1,7 +1,8 @@
 """What a result depends on beside its settings: the code that made it, and learned weights.
 
-The code is that of the agent, of the worlds it meets, and of everything of this project that those
-import; comments and docstrings do not count.
+The code is that of the agents, of the scenario's family and its worlds, and of everything of this
+project that those import; comments and docstrings do not count. Registries name modules and import
+none, so the family and the localizers are looked up.
 """
 
 import ast
@@ -17,21 +18,22 @@ import torch
 from torch import nn
 
 from agents.localizer import Localizer
+from coloc_env.scenarios.registry import SCENARIOS
 
 _PACKAGES = ("agents", "coloc_env", "training")
-_WORLD = (
-    "coloc_env.world",
-    "coloc_env.scenarios",
-    "coloc_env.bounds",
-    "training.evaluation.rollout",
-)
+_ONLY_REGISTER = ("agents", "coloc_env")  # to import these is to depend on nothing in them
+_WORLD = ("coloc_env.world", "coloc_env.bounds", "training.evaluation.rollout")
 
 
-def code_of(localizer: Localizer, *modules: str) -> str:
-    """Hash of the code that a localizer, the localizers it is made of, and its worlds run, and of
-    other modules."""
-    made_of = {type(part) for part in _parts(localizer, set()) if isinstance(part, Localizer)}
-    sources = sorted(filter(None, map(inspect.getsourcefile, made_of)))
+def code_of(
+    scenario: str, localizers: Iterable[Localizer] = (), modules: Iterable[str] = ()
+) -> str:
+    """Hash of the code of a scenario's family (by the scenario's id), of worlds, of localizers with
+    the localizers that they are made of, and of other modules."""
+    family = inspect.getsourcefile(inspect.unwrap(SCENARIOS[scenario]))
+    parts = {type(part) for one in localizers for part in _parts(one, set())}
+    made_of = [part for part in parts if issubclass(part, Localizer)]
+    sources = sorted(filter(None, (family, *map(inspect.getsourcefile, made_of))))
     first = [file for name in (*_WORLD, *modules) for file in _files(name)]
     return _closure((*first, *map(Path, sources)))
 
@@ -94,23 +96,27 @@ def _read(path: Path) -> tuple[str, tuple[Path, ...]]:
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
-    """Names that may be modules: ``a.b`` and, of ``from a import b``, both ``a`` and ``a.b``."""
-    for node in ast.walk(tree):
+    """Names that may be modules: ``a.b`` and, of ``from a import b``, both ``a`` and ``a.b``. What
+    only type checkers import is left out."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        else:
+            yield from _imported(node)
 
 
 @lru_cache
 def _files(name: str) -> tuple[Path, ...]:
-    """The file of a module of this project; none for anything else. Imports nothing.
-
-    ``agents`` itself only registers all agents: to import it is to depend on none of them.
-    """
+    """The file of a module of this project; none for anything else. Imports nothing."""
     package, *rest = name.split(".")
-    spec = importlib.util.find_spec(package) if package in _PACKAGES and name != "agents" else None
+    if package not in _PACKAGES or name in _ONLY_REGISTER:
+        return ()
+    spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:
         return ()
     path = Path(spec.origin).parent.joinpath(*rest)

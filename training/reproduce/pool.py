@@ -1,149 +1,157 @@
-"""Doing pieces of work in one process or several, with progress; what fails is told, not fatal."""
+"""Units of work in one process or several: what fails is reported, and nothing waits for ever.
+
+A worker ends with its parent, however that ends. A unit whose worker dies is tried once more.
+"""
+
+from __future__ import annotations
 
 import multiprocessing
-import queue
+import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    from training.reproduce.work import Unit
 
-from training.evaluation.evaluate import Progress
-from training.reproduce.store import Store
-from training.reproduce.study import Piece, Study, compute
-
-Note = Callable[[str], None]
-_OFTEN = 0.5  # s between reports of a process
-_ticks: Any = None  # in a worker: where it reports
+_OFTEN = 0.5  # s between a worker's reports of its progress
+_ATTEMPTS = 2
 
 
-def fly(study: Study, pieces: Sequence[Piece], jobs: int, tell: Progress, note: Note) -> None:
-    """Compute what is missing of ``pieces``, ``jobs`` at a time, each stored once it is done.
+def work(
+    units: Sequence[Unit], out: Path, jobs: int, progress: Callable[[int], None]
+) -> Iterator[tuple[Unit, str | None]]:
+    """Run units, ``jobs`` at a time; yield each as it is done, with what went wrong, if anything.
 
-    ``tell`` gets the share of all steps flown, ``note`` a line for every piece done. A piece that
-    raises is noted in ``study.failed``; the others go on.
+    ``progress`` is given what is done of the units' sizes.
     """
-    left = study.missing(pieces)
-    total, flown, start = sum(piece.size for piece in left), 0, time.monotonic()
-    for agent, why in dict.fromkeys((a, w) for (_, a), w in study.failed.items()):
-        note(f"{agent}: {why}")
-
-    def tick(steps: int) -> None:
-        nonlocal flown
-        flown += steps
-        tell("flights", flown, total)
-
-    if left:
-        tick(0)
-    for done, (piece, error) in enumerate(_work(left, study.store, jobs, tick), 1):
-        what = f"{done}/{len(left)} {piece.name}"
-        if error is not None:
-            study.failed[piece.variant.key, piece.agent] = error
-            what += f" failed: {error}"
-        note(f"{what} ({time.monotonic() - start:.0f} s)")
-
-
-def obtain(
-    study: Study, pieces: Sequence[Piece], jobs: int, tell: Progress, note: Note, missing: bool
-) -> None:
-    """``fly``; with ``missing=False`` only note in ``study.failed`` what there is not."""
-    if missing:
-        fly(study, pieces, jobs, tell, note)
+    if jobs == 1 or len(units) < 2:
+        for unit in units:
+            yield unit, _outcome(unit, out, progress)
     else:
-        study.do_without(pieces)
+        yield from _spread(units, out, min(jobs, len(units)), progress)
 
 
-def _work(
-    left: Sequence[Piece], store: Store, jobs: int, tick: Callable[[int], None]
-) -> Iterator[tuple[Piece, str | None]]:
-    if jobs == 1 or len(left) < 2:
-        for piece in left:
-            yield piece, _outcome(piece, store, tick)
-    else:
-        yield from _spread(left, store, jobs, tick)
+def _outcome(unit: Unit, out: Path, progress: Callable[[int], None]) -> str | None:
+    """Run a unit; what it raises is returned as words, an interruption aside."""
+    done = 0
 
-
-def _outcome(piece: Piece, store: Store, tick: Callable[[int], None]) -> str | None:
-    """Compute a piece; what it raises is returned as words, an interruption aside."""
-    before = 0
-
-    def tell(what: str, done: int, total: int) -> None:
-        nonlocal before
-        if what == piece.agent:
-            tick(done - before)
-            before = done
+    def counted(size: int) -> None:
+        nonlocal done
+        done += size
+        progress(size)
 
     try:
-        compute(piece, store, tell)
+        unit.run(out, counted)
     except Exception as error:
+        progress(unit.size - done)
         return f"{type(error).__name__}: {error}"
-    finally:
-        tick(piece.size - before)
     return None
 
 
 # ------------------------------------------------------------------ several processes
 
 
+class _Worker:
+    """A process that runs one unit at a time."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process = context.Process(target=_serve, args=(other,), daemon=True)
+        self.process.start()
+        other.close()  # so that the pipe ends when the worker does
+        self.unit: Unit | None = None
+        self.done = 0  # of the unit's size
+
+    def give(self, unit: Unit, out: Path) -> None:
+        self.unit, self.done = unit, 0
+        with suppress(BrokenPipeError):  # it died: to wait for its answer is to learn that
+            self.pipe.send((unit, unit.settings(), out))
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
 def _spread(
-    left: Sequence[Piece], store: Store, jobs: int, tick: Callable[[int], None]
-) -> Iterator[tuple[Piece, str | None]]:
-    context = multiprocessing.get_context("spawn")
-    ticks = context.Queue()
-    pool = ProcessPoolExecutor(jobs, context, _begin, (ticks,))
+    units: Sequence[Unit], out: Path, jobs: int, progress: Callable[[int], None]
+) -> Iterator[tuple[Unit, str | None]]:
+    left, attempts = list(reversed(units)), dict.fromkeys(units, 0)
+    workers: list[_Worker] = []
     try:
-        asked = {pool.submit(_task, piece, piece.settings(), store.folder): piece for piece in left}
-        open_: set[Future[str | None]] = set(asked)
-        while open_:
-            done, open_ = wait(open_, _OFTEN, FIRST_COMPLETED)
-            _drain(ticks, tick)
-            for future in done:
-                yield asked[future], future.result()
-    except BrokenProcessPool:
-        raise ChildProcessError(
-            "a process ended abruptly (out of memory?); what is done is kept: the same command "
-            "goes on from there"
-        ) from None
-    except BaseException:
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
+        while left or workers:
+            while left and len(workers) < jobs:
+                workers.append(_Worker())
+                workers[-1].give(_next(left, attempts), out)
+            for pipe in wait([worker.pipe for worker in workers]):
+                worker = next(each for each in workers if each.pipe is pipe)
+                unit = worker.unit
+                assert unit is not None
+                try:
+                    size, error, finished = worker.pipe.recv()
+                except (EOFError, OSError):  # it died
+                    workers.remove(worker)
+                    worker.end()
+                    progress(-worker.done)
+                    if attempts[unit] < _ATTEMPTS:
+                        left.append(unit)
+                    else:
+                        progress(unit.size)
+                        yield unit, f"its process died {_ATTEMPTS} times (out of memory?)"
+                    continue
+                worker.done += size
+                progress(size)
+                if finished:
+                    yield unit, error
+                    if left:
+                        worker.give(_next(left, attempts), out)
+                    else:
+                        workers.remove(worker)
+                        worker.end()
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for worker in workers:
+            worker.end()
 
 
-def _drain(ticks: Any, tick: Callable[[int], None]) -> None:
-    while True:
-        try:
-            tick(ticks.get_nowait())
-        except queue.Empty:
-            return
+def _next(left: list[Unit], attempts: dict[Unit, int]) -> Unit:
+    attempts[left[-1]] += 1
+    return left.pop()
 
 
-def _begin(ticks: Any) -> None:
-    """In a worker: one thread, reports to ``ticks``, and the parent alone hears Ctrl-C."""
-    global _ticks
-    _ticks = ticks
+def _serve(pipe: Connection) -> None:
+    """In a worker: the parent alone hears Ctrl-C, and its end is the worker's."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-
-
-def _task(piece: Piece, settings: dict[str, Any], folder: Path) -> str | None:
-    if piece.settings() != settings:
-        return "the code changed while the study ran: run the command again"
     held, last = 0, 0.0
 
-    def tick(steps: int) -> None:
+    def progress(size: int) -> None:
         nonlocal held, last
-        held += steps
+        held += size
         if time.monotonic() - last > _OFTEN:
-            _ticks.put(held)
+            pipe.send((held, None, False))
             held, last = 0, time.monotonic()
 
-    error = _outcome(piece, Store(folder), tick)
-    _ticks.put(held)
-    return error
+    while True:
+        try:
+            unit, settings, out = pipe.recv()
+        except EOFError:
+            return
+        held = 0
+        error: str | None = "the code changed while the study ran: run the command again"
+        if unit.settings() == settings:
+            error = _outcome(unit, out, progress)
+        pipe.send((held, error, True))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -1,13 +1,14 @@
-"""What has been computed so far, a file a piece: whatever stops the work, what is done stays done.
+"""The store: a file for every piece that has been computed, so that no work is lost or mixed up.
 
 A piece is known by everything that it depends on; that decides its file's name and stands in the
-file too. So pieces of other settings, other code or other weights are never taken for one another.
+file too. A file is a NumPy archive followed by its SHA-256: it is read only if that fits, so that
+a damaged file is never taken for a result.
 """
 
 import hashlib
+import io
 import json
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ import numpy as np
 from coloc_env.staging import staged_file
 
 Arrays = dict[str, np.ndarray]
+Facts = dict[str, Any]
 _FACTS = "facts.json"
+_DIGEST = hashlib.sha256().digest_size  # bytes
 
 
 class Store:
@@ -33,31 +36,45 @@ class Store:
         return self.folder / f"{plain}-{digest}.npz"
 
     def has(self, name: str, settings: Mapping[str, Any]) -> bool:
-        """Whether a piece has been computed with exactly these settings."""
-        return self.path(name, settings).is_file()
+        """Whether a piece has been computed with exactly these settings, and is not damaged."""
+        path = self.path(name, settings)
+        return path.is_file() and _archive(path) is not None
 
     def save(
         self, name: str, settings: Mapping[str, Any], arrays: Arrays, facts: Mapping[str, Any]
     ) -> None:
-        """Write a piece at once or not at all; ``facts`` are what JSON can say."""
+        """Write a piece at once or not at all; ``facts``: what JSON can hold."""
         text = json.dumps({"settings": settings, "facts": facts})
+        archive = io.BytesIO()
         content = {_FACTS: np.frombuffer(text.encode(), np.uint8), **arrays}
+        np.savez_compressed(archive, **content)  # type: ignore[arg-type]
         with staged_file(self.path(name, settings)) as file:
-            np.savez_compressed(file, **content)  # type: ignore[arg-type]
+            file.write_bytes(archive.getvalue() + hashlib.sha256(archive.getvalue()).digest())
 
-    def load(self, name: str, settings: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
+    def load(self, name: str, settings: Mapping[str, Any]) -> tuple[Arrays, Facts]:
         """A piece's arrays and facts. ValueError if the file is damaged, or was made with other
         settings than its name says."""
         path = self.path(name, settings)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in file.files}
-            told = json.loads(arrays.pop(_FACTS).tobytes())
-        except (zipfile.BadZipFile, EOFError, KeyError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error}); remove it to compute it anew") from None
-        if _canonical(told["settings"]) != _canonical(settings):
-            raise ValueError(f"{path} was made with other settings; remove it to compute it anew")
-        return arrays, told["facts"]
+        archive = _archive(path)
+        if archive is None:
+            raise ValueError(f"{path} is damaged: run the command again to compute it again")
+        with np.load(io.BytesIO(archive), allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+        content = json.loads(arrays.pop(_FACTS).tobytes())
+        if _canonical(content["settings"]) != _canonical(settings):
+            raise ValueError(f"{path} was made with other settings: remove it")
+        return arrays, content["facts"]
+
+    def empty(self) -> bool:
+        """Whether nothing is stored."""
+        return next(self.folder.rglob("*.npz"), None) is None
+
+
+def _archive(path: Path) -> bytes | None:
+    """A file's archive; None if its checksum does not fit."""
+    content = path.read_bytes()
+    archive, digest = content[:-_DIGEST], content[-_DIGEST:]
+    return archive if hashlib.sha256(archive).digest() == digest else None
 
 
 def _canonical(settings: Mapping[str, Any]) -> str:

@@ -1,227 +1,289 @@
-"""Agents in variants of scenarios: what is to be flown, and the results put together again.
+"""A study as data, and the machine that runs it: plan, results, verdicts, figures, page."""
 
-A piece of work is one agent in one variant over a block of seeds, or (agent ``WORLD``) the worlds
-themselves, with their bound unless the variant says otherwise, or a bound alone (``BOUNDS``), which
-may take longer than all flights and need fewer runs. More runs of the same are another block, so
-that tables over 20 runs and a figure over 30 share what they can; and whatever was computed for one
-table serves all.
-"""
+from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
-from agents.registry import make
-from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bound
+from agents.registry import LOCALIZERS
 from coloc_env.options import require_known
-from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
-from training.evaluation.evaluate import Progress, evaluate, silent
-from training.evaluation.record import RunRecord, Worlds
-from training.evaluation.results import Evaluation
-from training.reproduce.identity import code_of, weights_of
-from training.reproduce.store import Arrays, Store
+from coloc_env.registry import Registry
+from coloc_env.staging import staged_folder
+from training.evaluation.evaluate import Progress, silent
+from training.evaluation.results import plain
+from training.reproduce import page, pool, verdicts
+from training.reproduce.cost import COST, Cost
+from training.reproduce.drawing import Drawing, draw
+from training.reproduce.results import Results
+from training.reproduce.settings import Settings
+from training.reproduce.tables import Table
+from training.reproduce.verdicts import Claim, Goal
+from training.reproduce.work import Cell, Piece, Training, Unit
 
-WORLD = "dead_reckoning"  # flown with the bound, for the worlds' truth: it applies to all of them
-BOUNDS: dict[str, Callable[[Scenario, int, int], Bound]] = {
-    "posterior_bound": posterior_bound,
-    "snapshot_bound": snapshot_bound,
-}
+STUDIES = Registry(
+    "study",
+    "coloc.studies",
+    {
+        "cspf": "training.reproduce.cspf:cspf",
+        "marl": "training.reproduce.marl:marl",
+        "nnhpff": "training.reproduce.nnhpff:nnhpff",
+        "pfnn": "training.reproduce.pfnn:pfnn",
+        "stdcl": "training.reproduce.stdcl:stdcl",
+    },
+)
+FILES = ("results.json", "page.md")  # beside the figures
+_VERSIONS = ("torch", "numpy")
+
+
+def _none(_: Any) -> Iterable[Any]:
+    return ()
 
 
 @dataclass(frozen=True)
-class Variant:
-    """A scenario with some overrides, known by ``key``; at most ``steps`` long. ``bounded``:
-    its worlds are flown with their posterior bound."""
+class Part:
+    """A part of a study: what is planned, claimed, to be reached, tabulated and drawn.
+
+    ``trainings``: what must be trained before ``cells`` can run. ``figures`` by file name.
+    """
+
+    title: str
+    cells: Callable[[Settings], Iterable[Cell]]
+    text: Callable[[Settings], Iterable[str]] = _none
+    claims: Callable[[Settings], Iterable[Claim]] = _none
+    goals: Callable[[Settings], Iterable[Goal]] = _none
+    tables: Callable[[Results], Iterable[Table]] = _none
+    figures: Mapping[str, Drawing] = field(default_factory=dict)
+    trainings: Callable[[Settings], Iterable[Training]] = _none
+
+
+@dataclass(frozen=True)
+class Study:
+    """A paper (or another question): its ``name`` in the registry and in words, where it was
+    published, how many ``runs`` its main tables have, and its parts."""
 
     key: str
-    title: str
-    overrides: tuple[tuple[str, Any], ...] = ()
-    scenario: str = "indoor-v0"
-    steps: int | None = None
-    bounded: bool = True
-
-    def build(self) -> Scenario:
-        """ValueError or OSError where it cannot be (recordings that are not there)."""
-        return _built(self)
-
-
-Planned = tuple[Variant, tuple[str, ...], int]  # who flies there, and how often
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One agent in the worlds of ``runs`` seeds from ``seed`` on."""
-
-    variant: Variant
-    agent: str
-    seed: int
+    name: str
+    source: str
     runs: int
+    parts: Mapping[str, Part]
+
+    def chosen(self, settings: Settings) -> list[Part]:
+        """The parts asked for. ValueError for one that does not exist."""
+        if settings.part != "all" and settings.part not in self.parts:
+            allowed = ", ".join((*self.parts, "all"))
+            raise ValueError(f"{self.key} has no part {settings.part!r}: {allowed} are allowed")
+        return [part for key, part in self.parts.items() if settings.part in (key, "all")]
 
     @property
-    def name(self) -> str:
-        agent = self.agent.replace("/", "_")  # options may hold paths
-        return f"{self.variant.key}/{agent}-{self.seed}+{self.runs}"
-
-    @property
-    def size(self) -> int:
-        """Steps of all runs."""
-        return self.runs * self.variant.build().horizon
-
-    def settings(self) -> dict[str, Any]:
-        """All that the result depends on. ValueError if the agent cannot serve the scenario."""
-        return _settings(self)
+    def files(self) -> tuple[str, ...]:
+        """All that may be written."""
+        return (*(name for part in self.parts.values() for name in part.figures), *FILES)
 
 
-@lru_cache(maxsize=8)
-def _built(variant: Variant) -> Scenario:
-    built = make_scenario(variant.scenario, **dict(variant.overrides))
-    steps = built.horizon if variant.steps is None else min(variant.steps, built.horizon)
-    return replace(built, horizon=steps)
+def reproduce(
+    study: Study,
+    settings: Settings,
+    progress: Progress = silent,
+    report: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Compute what the store in ``settings.out`` lacks, then write the results there.
+
+    ``report`` is given a line for every unit of work that is done.
+    """
+    parts = study.chosen(settings)
+    every = [cell for part in study.parts.values() for cell in part.cells(settings)]
+    cells = _asked([cell for part in parts for cell in part.cells(settings)], settings)
+    trainings = [training for part in parts for training in part.trainings(settings)]
+    _try_folder(settings.out, study.files)
+    if settings.fresh:
+        shutil.rmtree(settings.store, ignore_errors=True)
+    results = Results(settings, cells, every)
+    if settings.report_only:
+        if results.store.empty():
+            raise ValueError(f"{settings.store} holds nothing yet: run without --report-only first")
+    else:
+        _run([one for one in trainings if not one.done(settings.out)], "trainings", settings,
+             progress, report)  # fmt: skip
+    pieces = [piece for piece in results.pieces() if not piece.done(settings.out)]
+    if settings.report_only:
+        _note(results, [(piece, "not run") for piece in pieces])
+    else:
+        timed = [piece for piece in pieces if piece.kind is not None and piece.kind.together]
+        others = [piece for piece in pieces if piece not in timed]
+        for (_, subject), why in results.failed.items():
+            report(f"{subject}: {why}")
+        _note(results, _run(others, "simulations", settings, progress, report))
+        for piece in timed:  # alone on the machine
+            piece.run(settings.out, lambda steps: None)
+            report(f"timed {piece.variant.key}")
+    with staged_folder(settings.out, study.files) as folder:
+        page.write(_content(study, parts, results, folder), folder, FILES)
 
 
-@cache
-def _settings(piece: Piece) -> dict[str, Any]:
-    scenario = piece.variant.build()
-    localizer = make(WORLD if piece.agent in BOUNDS else piece.agent, scenario)
+def _asked(cells: Sequence[Cell], settings: Settings) -> list[Cell]:
+    """Those of the variants and agents asked for. ValueError for what is in no cell."""
+    keys = dict.fromkeys(cell.variant.key for cell in cells)
+    require_known("variant", settings.variants, keys)
+    known = dict.fromkeys(agent for cell in cells for agent in cell.agents)
+    for agent in settings.agents or ():
+        LOCALIZERS.require(agent.split(":")[0])
+        if agent not in known:
+            raise ValueError(f"agent {agent!r} is not in this study: {', '.join(known)} are")
+    found = []
+    for cell in cells:
+        agents = tuple(a for a in cell.agents if settings.agents is None or a in settings.agents)
+        wanted = settings.variants is None or cell.variant.key in settings.variants
+        if wanted and (agents or not cell.agents or cell.kind is None):
+            found.append(Cell(cell.variant, agents, cell.runs, cell.kind, cell.key))
+    return found
+
+
+def _try_folder(out: Path, names: Sequence[str]) -> None:
+    """Raise ValueError now if results cannot be written there later."""
+    trial = RuntimeError()
+    try:
+        with staged_folder(out, names):
+            raise trial
+    except RuntimeError as error:
+        if error is not trial:
+            raise
+
+
+def _run(
+    units: Sequence[Unit],
+    what: str,
+    settings: Settings,
+    progress: Progress,
+    report: Callable[[str], None],
+) -> list[tuple[Unit, str]]:
+    """Run units of work; those that failed, with the reason."""
+    total, done, start = sum(unit.size for unit in units), 0, time.monotonic()
+
+    def counted(size: int) -> None:
+        nonlocal done
+        done += size
+        progress(what, done, total)
+
+    failed = []
+    for i, (unit, error) in enumerate(pool.work(units, settings.out, settings.jobs, counted), 1):
+        line = f"{i}/{len(units)} {unit.name}"
+        if error is not None:
+            failed.append((unit, error))
+            line += f" failed: {error}"
+        report(f"{line} ({time.monotonic() - start:.0f} s)")
+    return failed
+
+
+def _note(results: Results, failed: Iterable[tuple[Unit, str]]) -> None:
+    for unit, why in failed:
+        if isinstance(unit, Piece):
+            results.failed[unit.variant.key, unit.subject] = why
+
+
+# ------------------------------------------------------------------ what is written
+
+
+def _content(study: Study, parts: Sequence[Part], results: Results, folder: Path) -> dict[str, Any]:
+    """``results.json``; figures are written to the folder."""
+    settings = results.settings
+    claims = verdicts.judge((c for part in parts for c in part.claims(settings)), results)
+    wanted = {
+        goal.words: goal
+        for part in parts
+        for goal in part.goals(settings)
+        if all(need[0] in results.cells for need in goal.needs)
+    }
+    goals = verdicts.judge_goals(wanted.values(), results)
+    sections = []
+    if claims:
+        kinds = (verdicts.REPRODUCED, verdicts.NOT, verdicts.CONTRADICTED, verdicts.UNKNOWN)
+        text = [verdicts.RULE, verdicts.counts(claims, "claims", kinds)]
+        sections.append(_section("The paper's claims", text, [verdicts.claims_table(claims)]))
+    if goals:
+        found = verdicts.counts(goals, "goals", (verdicts.MET, verdicts.MISSED, verdicts.UNKNOWN))
+        text = [verdicts.GOAL_RULE, found]
+        sections.append(_section("Our goals", text, [verdicts.goals_table(goals)]))
+    for part in parts:
+        tables = [table for table in part.tables(results) if table.rows]
+        section = _section(part.title, part.text(settings), tables)
+        for name, drawing in part.figures.items():
+            caption = draw(drawing, results, folder / name)
+            if caption is not None:
+                section["figures"].append({"file": name, "caption": caption})
+        sections.append(section)
+    content = {
+        "study": study.name,
+        "source": study.source,
+        "provenance": _provenance(study, settings),
+        "sections": sections,
+        "claims": [verdicts.as_json(each) for each in claims],
+        "goals": [verdicts.as_json(each) for each in goals],
+        "figures": results.summaries(),
+        "costs": _costs(results),
+        "not_run": _not_run(results),
+    }
+    values: dict[str, Any] = plain(content)
+    return values
+
+
+def _section(title: str, text: Iterable[str], tables: Sequence[Table]) -> dict[str, Any]:
+    written = [table.as_json() for table in tables]
+    return {"title": title, "text": list(text), "tables": written, "figures": []}
+
+
+def _costs(results: Results) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in results.cells:
+        costs: dict[str, Cost] = results.kinds(name, COST)
+        for agent, one in costs.items():
+            found.setdefault(name, {})[agent] = one.summary
+    return found
+
+
+def _not_run(results: Results) -> list[str]:
+    """What there is no result of, and why; agents that fail alike in the same places together."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for (key, subject), why in results.failed.items():
+        places.setdefault((subject, why), []).append(f"*{key}*")
+    subjects: dict[tuple[str, str], list[str]] = {}
+    for (subject, why), keys in places.items():
+        subjects.setdefault((", ".join(keys), why), []).append(f"`{subject}`")
+    return [f"{keys}, {', '.join(some)}: {why}" for (keys, why), some in subjects.items()]
+
+
+def _provenance(study: Study, settings: Settings) -> dict[str, Any]:
+    """Where results come from."""
+    chosen = {"part": settings.part, "runs": settings.runs, "seed": settings.seed,
+              "steps": settings.steps}  # fmt: skip
+    usual = {"part": "all", "runs": study.runs, "seed": 0, "steps": None}
+    words = [f"--{key} {value}" for key, value in chosen.items() if value != usual[key]]
+    lists = {"agents": settings.agents, "variants": settings.variants}
+    words += [f"--{key} {','.join(some)}" for key, some in lists.items() if some is not None]
     return {
-        "scenario": scenario.name,
-        "overrides": dict(piece.variant.overrides),
-        "steps": scenario.horizon,
-        "seed": piece.seed,
-        "runs": piece.runs,
-        "agent": piece.agent,
-        "bounded": piece.variant.bounded,
-        "weights": weights_of(localizer),
-        "code": code_of(localizer),
-        "torch": str(torch.__version__),
+        "command": " ".join(("coloc reproduce", study.key, *words)),
+        "commit": _commit(),
+        "versions": {"python": platform.python_version()}
+        | {name: metadata.version(name) for name in _VERSIONS},
+        "machine": platform.processor() or platform.machine(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "runs": settings.runs,
+        "seed": settings.seed,
     }
 
 
-def compute(piece: Piece, store: Store, progress: Progress = silent) -> None:
-    """Fly a piece, or compute a bound, and store what came of it."""
-    settings = piece.settings()
-    scenario, of_world = piece.variant.build(), piece.agent == WORLD
-    if piece.agent in BOUNDS:
-        known = BOUNDS[piece.agent](scenario, piece.runs, piece.seed)
-        store.save(piece.name, settings, _bound_arrays(known), {})
-        return
-    with_bound = of_world and piece.variant.bounded
-    found = evaluate(scenario, [piece.agent], piece.runs, piece.seed, progress, bound=with_bound)
-    arrays, facts = found.agents[piece.agent].to_arrays()
-    if of_world:
-        arrays |= found.worlds.to_arrays()
-        if found.bound is not None:
-            arrays |= _bound_arrays(found.bound)
-    store.save(piece.name, settings, arrays, facts | {"start": found.worlds.truth[:, 0].tolist()})
-
-
-def _bound_arrays(known: Bound) -> Arrays:
-    return {"bound_mse": known.mse.numpy(), "bound_scored": known.scored.numpy()}
-
-
-class Study:
-    """What a store holds of agents in variants over the same seeds."""
-
-    def __init__(self, store: Store, seed: int) -> None:
-        self.store, self.seed = store, seed
-        self.failed: dict[tuple[str, str], str] = {}  # (variant's key, agent): why
-
-    def pieces(self, variant: Variant, agent: str, *blocks: int) -> list[Piece]:
-        """Blocks of so many runs each, one after the other."""
-        starts = np.cumsum((0, *blocks[:-1])).tolist()
-        return [
-            Piece(variant, agent, self.seed + start, runs)
-            for start, runs in zip(starts, blocks, strict=True)
-        ]
-
-    def chosen(
-        self,
-        planned: Sequence[Planned],
-        where: Sequence[str] | None,
-        agents: Sequence[str] | None = None,
-    ) -> list[Piece]:
-        """The pieces of a plan in the variants ``where``, of these agents (None: all); the rest is
-        noted in ``failed``. Raises ValueError for a variant that is not in the plan."""
-        require_known("variant", where, dict.fromkeys(variant.key for variant, _, _ in planned))
-        found: list[Piece] = []
-        for variant, able, count in planned:
-            if where is not None and variant.key not in where:
-                self.failed[variant.key, WORLD] = "not asked for"
-                continue
-            for agent in (WORLD, *able):
-                pieces = self.pieces(variant, agent, count)
-                if agents is None or agent in (WORLD, *agents):
-                    found += pieces
-                else:
-                    self.do_without(pieces)
-        return found
-
-    def missing(self, pieces: Sequence[Piece]) -> list[Piece]:
-        """Those not computed yet, once each. Where the scenario cannot be built, or the agent does
-        not serve it, that is noted in ``failed``."""
-        left = []
-        for piece in dict.fromkeys(pieces):
-            try:
-                if not self.store.has(piece.name, piece.settings()):
-                    left.append(piece)
-            except (ValueError, OSError) as error:
-                self.failed[piece.variant.key, piece.agent] = str(error)
-        return left
-
-    def do_without(self, pieces: Sequence[Piece]) -> None:
-        """Note in ``failed`` what has not been computed."""
-        for piece in self.missing(pieces):
-            self.failed[piece.variant.key, piece.agent] = "not flown"
-
-    def can(self, variant: Variant) -> bool:
-        """Whether the variant's worlds are there."""
-        return (variant.key, WORLD) not in self.failed
-
-    def results(self, variant: Variant, agents: Sequence[str], *runs: int) -> Evaluation:
-        """All agents that did not fail, over all blocks of ``runs``."""
-        scenario = variant.build()
-        worlds = [self._load(piece) for piece in self.pieces(variant, WORLD, *runs)]
-        first = worlds[0][0]
-        bound = None
-        if "bound_mse" in first:
-            mse, scored = (
-                torch.from_numpy(_joined(worlds, f"bound_{key}")) for key in ("mse", "scored")
-            )
-            bound = Bound(mse, scored, scenario.arena.dt)
-        starts = [facts["start"] for _, facts in worlds]
-        met = Worlds.cat([Worlds.from_arrays(self.seed, arrays) for arrays, _ in worlds])
-        found = {}
-        for agent in agents:
-            if (variant.key, agent) in self.failed:
-                continue
-            blocks = [self._load(piece) for piece in self.pieces(variant, agent, *runs)]
-            if [facts["start"] for _, facts in blocks] != starts:
-                raise ValueError(f"{variant.key}: {agent} met other worlds than the bound")
-            parts = [RunRecord.from_arrays(met, arrays, facts) for arrays, facts in blocks]
-            found[agent] = RunRecord.cat(parts, met)
-        return Evaluation(scenario, met, bound, found)
-
-    def bound(self, variant: Variant, which: str, runs: int) -> Bound | None:
-        """One of ``BOUNDS`` over the first ``runs`` runs; None if it could not be computed."""
-        if (variant.key, which) in self.failed:
-            return None
-        (piece,) = self.pieces(variant, which, runs)
-        arrays, _ = self._load(piece)
-        kind = SnapshotBound if which == "snapshot_bound" else Bound
-        mse, scored = (torch.from_numpy(arrays[f"bound_{key}"]) for key in ("mse", "scored"))
-        return kind(mse, scored, variant.build().arena.dt)
-
-    def _load(self, piece: Piece) -> tuple[Arrays, dict[str, Any]]:
-        return self.store.load(piece.name, piece.settings())
-
-
-Loaded = Sequence[tuple[Arrays, dict[str, Any]]]
-
-
-def _joined(blocks: Loaded, key: str) -> np.ndarray:
-    return np.concatenate([arrays[key] for arrays, _ in blocks])
+def _commit() -> str | None:
+    """The commit that this code lies in, if it lies in a repository."""
+    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        done = subprocess.run(asked, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

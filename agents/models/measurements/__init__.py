@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, heard, nobody
+from agents.models.measurements.base import Block, Measurement, Neighbours, no_neighbours, received
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
@@ -39,11 +39,11 @@ __all__ = [
     "Slowness",
     "UavRangeBearings",
     "UavRanges",
-    "heard",
     "make_measurements",
     "measures",
     "model_of",
-    "nobody",
+    "no_neighbours",
+    "received",
 ]
 
 _M = TypeVar("_M", bound=Callable[[Any], Measurement])

@@ -5,14 +5,18 @@ UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from agents.models.process import Process
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
+
+_FARTHEST = 1e4  # m: of distances that a sensor can measure
+_LEAST_STD = 1e-3  # m, rad
 
 
 @dataclass(frozen=True)
@@ -25,21 +29,23 @@ class Neighbours:
     known: Bool[Tensor, "B N S"]
 
 
-def nobody(position: Float[Tensor, "*s d"]) -> Neighbours:
+def no_neighbours(position: Float[Tensor, "*s d"]) -> Neighbours:
     """No slots at all, for what a UAV at some position measures without others."""
     none = position.unsqueeze(-2)[..., :0, :]
     return Neighbours(none, none, none[..., 0] > 0)
 
 
-def heard(believed: Believed, observation: Observation) -> Neighbours:
-    """Neighbours as their messages tell: past estimates, moved on at their velocity."""
+def received(believed: Believed, observation: Observation) -> Neighbours:
+    """Neighbours by their messages: past estimates, propagated at constant velocity."""
     d = believed.arena.dim
     content = observation["messages"].double().unflatten(-1, (believed.slots, 3 * d))
+    known = (observation["message_mask"] > 0) & content.isfinite().all(-1)
+    content = content.masked_fill(~known.unsqueeze(-1), 0.0)
     age = believed.arena.dt * (1 + believed.message_delay)
     return Neighbours(
         position=content[..., :d] + age * content[..., d : 2 * d],
         variance=(2 * content[..., 2 * d :]).exp(),
-        known=observation["message_mask"] > 0,
+        known=known,
     )
 
 
@@ -51,7 +57,8 @@ class Block:
     ``variance`` the measurement's own noise (diagonal).
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
     position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
-    ``per_slot``) flattened, and ``mutual`` says that both UAVs hold the very same number.
+    ``per_slot``) flattened, and ``mutual``: both UAVs hold the very same number.
+    ``distance`` (m) is that to the other UAV where it is what was measured.
     """
 
     residual: Float[Tensor, "B N m k"]
@@ -62,6 +69,7 @@ class Block:
     partner_variance: Float[Tensor, "B N m k"] | None = None
     per_slot: int = 1
     mutual: bool = False
+    distance: Float[Tensor, "B N m 1"] | None = None
 
     @property
     def total_variance(self) -> Float[Tensor, "B N m k"]:
@@ -70,10 +78,46 @@ class Block:
             return self.variance
         return self.variance + self.partner_variance
 
+    def of(self, slot: Int64[Tensor, "N"], slots: int) -> "Block":
+        """Only the measurements that involve the UAV in the slot (of ``slots``) given for each."""
+        every = torch.arange(slots, device=slot.device).repeat_interleave(self.per_slot)
+        every = every.repeat(self.mask.shape[-1] // len(every))
+        return replace(self, mask=self.mask & (every == slot.unsqueeze(-1)))
+
+    def bent(self, apart: Float[Tensor, "B N d d"], steps: float) -> "Block":
+        """With what linearizing distances neglects as noise: their variance grows by
+        ((tr M − uᵀ M u) / 2 d)², M being the covariance of the two UAVs' relative position, d their
+        distance and u its direction; by ``steps`` times that where so many steps share the error.
+        """
+        if self.distance is None:
+            return self
+        assert self.partner is not None
+        u, m = self.partner, apart[:, :, None, None]  # [B, N, m, 1, d] and [B, N, 1, 1, d, d]
+        along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
+        lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+        return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
+
+
+def usable(
+    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
+) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
+    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
+    ``ranges``, the first is no distance that a sensor can give. Every measurement model reads its
+    leaves through this."""
+    mask = mask & z.isfinite().all(-1)
+    if ranges:
+        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
+    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
+
+
+def noise_std(std: float) -> float:
+    """The noise (m, rad) that a filter may assume: a sensor without any would leave no weights."""
+    return max(std, _LEAST_STD)
+
 
 class Measurement(ABC):
-    """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` says which of its
-    measurements are there (None: a single one, always)."""
+    """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
+    that marks which of its measurements are there (None: a single one, always)."""
 
     cooperative = False
     mask_leaf: str | None = None

@@ -1,10 +1,16 @@
 """Range and bearing in the plane, to landmarks and to other UAVs."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.models.measurements.base import Block, Measurement, Neighbours
+from agents.models.measurements.base import (
+    Block,
+    Measurement,
+    Neighbours,
+    noise_std,
+    usable,
+)
 from agents.models.process import Process
 from coloc_env.geometry import wrap_angle
 from coloc_env.observation import Observation
@@ -40,7 +46,15 @@ class LandmarkRangeBearings(Measurement):
     mask_leaf = "landmark_bearing_mask"
 
     def __init__(self, sensor: LandmarkBearings) -> None:
-        self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth
+        self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
+        self.depth = sensor.depth
+
+    def read(
+        self, observation: Observation
+    ) -> tuple[Float[Tensor, "B N m 2"], Bool[Tensor, "B N m"]]:
+        """Range (m) and bearing (rad), and where they were measured."""
+        z = observation["landmark_bearings"].unflatten(-1, (-1, 2))
+        return usable(z, observation[self.mask_leaf] > 0, ranges=True)
 
     def linearize(
         self,
@@ -50,26 +64,34 @@ class LandmarkRangeBearings(Measurement):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        z = observation["landmark_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        z, mask = self.read(observation)
         points = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, 2))
         points = torch.cat([points] * self.depth, -2)
-        residual, jacobian, _ = _range_bearing(process, x, z, points)
+        residual, jacobian, _ = _range_bearing(process, x, z.to(x.dtype), points)
         return Block(
             residual=residual,
             jacobian=jacobian,
             variance=(x.new_tensor(self.std) ** 2).expand_as(residual),
-            mask=observation["landmark_bearing_mask"] > 0,
+            mask=mask,
         )
 
 
 class UavRangeBearings(Measurement):
-    """Range and bearing to neighbours, whose position is known as well as ``neighbours`` says."""
+    """Range and bearing to neighbours, whose position is uncertain as ``neighbours`` states."""
 
     cooperative = True
     mask_leaf = "uav_bearing_mask"
 
     def __init__(self, sensor: UavBearings) -> None:
-        self.std, self.depth = (sensor.range_std, sensor.bearing_std), sensor.depth
+        self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
+        self.depth = sensor.depth
+
+    def read(
+        self, observation: Observation
+    ) -> tuple[Float[Tensor, "B N m 2"], Bool[Tensor, "B N m"]]:
+        """Range (m) and bearing (rad), and where they were measured."""
+        z = observation["uav_bearings"].unflatten(-1, (-1, 2))
+        return usable(z, observation[self.mask_leaf] > 0, ranges=True)
 
     def linearize(
         self,
@@ -79,16 +101,16 @@ class UavRangeBearings(Measurement):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        z = observation["uav_bearings"].to(x.dtype).unflatten(-1, (-1, 2))
+        z, mask = self.read(observation)
         points = torch.cat([neighbours.position] * self.depth, -2)
-        residual, jacobian, by_point = _range_bearing(process, x, z, points)
+        residual, jacobian, by_point = _range_bearing(process, x, z.to(x.dtype), points)
         theirs = torch.cat([neighbours.variance] * self.depth, -2)
         known = torch.cat([neighbours.known] * self.depth, -1)
         return Block(
             residual=residual,
             jacobian=jacobian,
             variance=(x.new_tensor(self.std) ** 2).expand_as(residual),
-            mask=(observation["uav_bearing_mask"] > 0) & known,
+            mask=mask & known,
             partner=by_point,
             partner_variance=(by_point**2 * theirs.unsqueeze(-2)).sum(-1),
         )

@@ -4,7 +4,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.models.measurements.base import Block, Measurement, Neighbours
+from agents.models.measurements.base import (
+    Block,
+    Measurement,
+    Neighbours,
+    noise_std,
+    usable,
+)
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
@@ -15,9 +21,20 @@ from coloc_env.sensors.ranging import Tags
 class _Ranges(Measurement):
     """Distances from the UAV's own tags to points; shared by anchors and neighbours."""
 
+    leaf: str
+    mask_leaf: str
+
     def __init__(self, noise: RangeNoise, tags: Tags) -> None:
-        self.noise, self.variance = noise, noise.std**2
+        self.noise, self.variance = noise, noise_std(noise.std) ** 2
         self.tags = tags
+
+    def read(
+        self, observation: Observation
+    ) -> tuple[Float[Tensor, "B N F"], Bool[Tensor, "B N F"]]:
+        """Distances (m), and where they were measured."""
+        z = observation[self.leaf].unsqueeze(-1)
+        z, mask = usable(z, observation[self.mask_leaf] > 0, ranges=True)
+        return z[..., 0], mask
 
     def _arms(self, x: Float[Tensor, "B N S"]) -> Float[Tensor, "B N T d"]:
         """Lever arms [N, T, d], with a dimension 1 for particles where x has them."""
@@ -50,7 +67,7 @@ class _Ranges(Measurement):
         flat = distance.flatten(-2).unsqueeze(-1)
         if not self.noise.per_metre:
             return flat.new_tensor(self.variance).expand_as(flat)
-        return (self.noise.std + self.noise.per_metre * flat) ** 2
+        return (noise_std(self.noise.std) + self.noise.per_metre * flat) ** 2
 
     def _block(
         self,
@@ -86,14 +103,14 @@ class _Ranges(Measurement):
 class AnchorRanges(_Ranges):
     """Distances to anchors at known positions."""
 
-    mask_leaf, leaf = "anchor_range_mask", "anchor_ranges"
+    leaf, mask_leaf = "anchor_ranges", "anchor_range_mask"
 
     def ends(
         self, observation: Observation, neighbours: Neighbours
     ) -> tuple[Float[Tensor, "B N T*P"], Float[Tensor, "B N P d"]]:
         """What was measured (m), and the points that distances are to."""
         d = neighbours.position.shape[-1]
-        return observation["anchor_ranges"], observation["anchor_map"].unflatten(-1, (-1, d))
+        return self.read(observation)[0], observation["anchor_map"].unflatten(-1, (-1, d))
 
     def __init__(self, sensor: AnchorRanging) -> None:
         super().__init__(sensor.noise, sensor.tags)
@@ -109,25 +126,25 @@ class AnchorRanges(_Ranges):
     ) -> Block:
         anchors = observation["anchor_map"].to(x.dtype).unflatten(-1, (-1, process.dim))
         shape = (self.n_tags, anchors.shape[-2])
-        ranges = observation["anchor_ranges"].to(x.dtype).unflatten(-1, shape)
-        mask = (observation["anchor_range_mask"] > 0).unflatten(-1, shape)
+        z, there = self.read(observation)
+        ranges, mask = z.to(x.dtype).unflatten(-1, shape), there.unflatten(-1, shape)
         return self._block(process, x, ranges, mask, anchors.unsqueeze(-3), derivatives)[0]
 
 
 class UavRanges(_Ranges):
-    """Distances to neighbours, whose position is known as well as ``neighbours`` says.
+    """Distances to neighbours, whose position is uncertain as ``neighbours`` states.
 
     A neighbour's attitude is not in its message: its tag's lever arm counts as noise.
     """
 
     cooperative = True
-    mask_leaf, leaf = "range_mask", "ranges"
+    leaf, mask_leaf = "ranges", "range_mask"
 
     def ends(
         self, observation: Observation, neighbours: Neighbours
     ) -> tuple[Float[Tensor, "B N S*T*T"], Float[Tensor, "B N S d"]]:
         """What was measured (m), and the points that distances are to."""
-        return observation["ranges"], neighbours.position
+        return self.read(observation)[0], neighbours.position
 
     def __init__(self, sensor: Ranging) -> None:
         super().__init__(sensor.noise, sensor.tags)
@@ -150,8 +167,8 @@ class UavRanges(_Ranges):
 
         points = neighbours.position.repeat_interleave(t, -2).unsqueeze(-3)
         known = neighbours.known.repeat_interleave(t, -1).unsqueeze(-2)
-        mask = (by_own_tag(observation["range_mask"]) > 0) & known
-        ranges = by_own_tag(observation["ranges"].to(x.dtype))
+        z, there = self.read(observation)
+        ranges, mask = by_own_tag(z.to(x.dtype)), by_own_tag(there) & known
         block, unit = self._block(process, x, ranges, mask, points, derivatives)
         variance = neighbours.variance.repeat_interleave(t, -2).unsqueeze(-3)
         added = (unit**2 * variance).sum(-1) + self.their_arms
@@ -164,4 +181,5 @@ class UavRanges(_Ranges):
             partner_variance=added.flatten(-2).unsqueeze(-1),
             per_slot=t,
             mutual=True,
+            distance=(ranges.flatten(-2).unsqueeze(-1) - block.residual).clamp_min(1e-3),
         )

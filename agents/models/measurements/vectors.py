@@ -4,10 +4,16 @@ slowness."""
 from abc import abstractmethod
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.models.measurements.base import Block, Measurement, Neighbours
+from agents.models.measurements.base import (
+    Block,
+    Measurement,
+    Neighbours,
+    noise_std,
+    usable,
+)
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
@@ -20,7 +26,14 @@ class LandmarkVectors(Measurement):
     mask_leaf = "landmark_mask"
 
     def __init__(self, sensor: Landmarks) -> None:
-        self.std = sensor.std
+        self.std = noise_std(sensor.std)
+
+    def read(
+        self, observation: Observation, dim: int
+    ) -> tuple[Float[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
+        """What was measured (m), and where."""
+        z = observation["landmarks"].unflatten(-1, (-1, dim))
+        return usable(z, observation["landmark_mask"] > 0)
 
     def linearize(
         self,
@@ -36,10 +49,10 @@ class LandmarkVectors(Measurement):
             raise ValueError(
                 "landmark vectors are in the body frame: the motion model has no attitude"
             )
-        z = observation["landmarks"].to(x.dtype).unflatten(-1, (-1, d))
+        z, mask = self.read(observation, d)
         apart = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)) - x[..., None, :d]
         expected = apart @ rotation
-        residual = z - expected
+        residual = z.to(x.dtype) - expected
         jacobian = x.new_zeros(0)
         if derivatives:
             jacobian = x.new_zeros(*residual.shape, process.error_size)
@@ -52,7 +65,7 @@ class LandmarkVectors(Measurement):
             residual=residual,
             jacobian=jacobian,
             variance=x.new_tensor(self.std**2).expand_as(residual),
-            mask=observation["landmark_mask"] > 0,
+            mask=mask,
         )
 
 
@@ -60,7 +73,7 @@ class _Coordinates(Measurement):
     """Some components of position or velocity themselves, as one measurement."""
 
     def __init__(self, sensor: PositionFix | Height | SlowFlight) -> None:
-        self.variance = sensor.std**2
+        self.variance = noise_std(sensor.std) ** 2
 
     @abstractmethod
     def components(self, dim: int) -> slice:
@@ -79,14 +92,15 @@ class _Coordinates(Measurement):
         derivatives: bool = True,
     ) -> Block:
         part, z = self.components(process.dim), self.measured(observation)
+        mask = x.new_ones(*x.shape[:-1], 1, dtype=torch.bool)
+        if self.mask_leaf is not None:
+            mask = observation[self.mask_leaf] > 0
         if isinstance(z, Tensor):
-            z = z.to(x.dtype)
+            whole, mask = usable(z.unsqueeze(-2), mask)
+            z = whole[..., 0, :].to(x.dtype)
         residual = (z - x[..., part]).unsqueeze(-2)
         jacobian = x.new_zeros(*residual.shape, process.error_size)
         jacobian[..., part] = torch.eye(residual.shape[-1], dtype=x.dtype, device=x.device)
-        mask = torch.ones(residual.shape[:-1], dtype=torch.bool, device=x.device)
-        if self.mask_leaf is not None:
-            mask = observation[self.mask_leaf] > 0
         return Block(
             residual=residual,
             jacobian=jacobian,

@@ -58,7 +58,9 @@ def make_process(believed: Believed) -> Process:
         if displacement is None:
             raise ValueError("the believed motion is driven by displacements, but none is measured")
         return DisplacementProcess(arena.dim, arena.dt, displacement)
-    odometry = believed.sensor(Odometry)
-    if odometry is None:
-        raise ValueError("the believed motion is wheeled, but the team has no odometry")
-    return WheeledProcess(arena.dt, odometry)
+    if isinstance(settings, believed_processes.Wheeled):
+        odometry = believed.sensor(Odometry)
+        if odometry is None:
+            raise ValueError("the believed motion is wheeled, but the team has no odometry")
+        return WheeledProcess(arena.dt, odometry)
+    raise ValueError(f"{type(settings).__name__} motion has no model")

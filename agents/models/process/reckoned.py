@@ -16,7 +16,7 @@ from coloc_env.sensors import Displacement, Ins, Odometry
 class WheeledProcess(Process):
     """Planar dead reckoning: x = [p, v, θ], u = odometry [forward, left, turn] per second.
 
-    The velocity is what odometry says, not an estimated quantity: the error is [δp, δθ].
+    The velocity is the odometry's, not an estimated quantity: the error is [δp, δθ].
     """
 
     attitude_size = 1
@@ -80,9 +80,9 @@ class WheeledProcess(Process):
 
 
 class InsProcess(Process):
-    """x = [p, v], u = the velocity that the INS says: p' = p + u dt, v' = u.
+    """x = [p, v], u = the INS's velocity: p' = p + u dt, v' = u.
 
-    The velocity is what the INS says, not an estimated quantity: the error is δp.
+    The velocity is the INS's, not an estimated quantity: the error is δp.
     """
 
     def __init__(

@@ -393,7 +393,7 @@ def test_watching_is_stepping_without_the_estimate(tools: SimpleNamespace) -> No
         run = tools.play(localizer, scenario, [0, 1], 5)
         belief = run.beliefs[0]
         for k, seen in enumerate(run.observations):
-            belief = localizer.watch(belief, seen)
+            belief = localizer.advance(belief, seen)
             tools.assert_same(belief, run.beliefs[k + 1])
         state, covariance = localizer.gaussian(belief, run.observations[-1])
         d = scenario.arena.dim

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from agents.models.measurements import Block, Measurement, Neighbours, heard, make_measurements
+from agents.models.measurements import Block, Measurement, Neighbours, make_measurements, received
 from agents.models.process import Process, make_process
 from coloc_env import scenario as settings
 from coloc_env.motion import Aggressive, Arena, RandomVelocity
@@ -256,7 +256,7 @@ def test_messages_are_moved_to_now() -> None:
     """A message says where its sender was 1 + delay steps ago, and how fast it went."""
     believed = SimpleNamespace(arena=SimpleNamespace(dim=2, dt=0.1), slots=2, message_delay=2)
     sent = torch.tensor([[[1.0, 2.0, 3.0, 4.0, -1.0, -2.0] * 2]])
-    near = heard(
+    near = received(
         believed, Observation({"messages": sent, "message_mask": torch.tensor([[[1.0, 0.0]]])})
     )
     torch.testing.assert_close(

@@ -131,7 +131,7 @@ def test_particles_begin_anew_with_the_mean_and_covariance_given(
     localizer: Any = make(f"pf:particles={count}", scenario)
     belief = tools.play(localizer, scenario, [0, 1], 1).beliefs[-1]
     state, covariance = gaussian(localizer)
-    found = localizer.restarted(belief, torch.ones(2, 2, dtype=torch.bool), state, covariance)
+    found = localizer.restart_from(belief, torch.ones(2, 2, dtype=torch.bool), state, covariance)
     centre = state.float().unsqueeze(2)
     error = localizer.process.boxminus(found.particles, centre).double()
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -155,7 +155,7 @@ def test_draws_differ_from_step_to_step_and_uav_to_uav(tools: SimpleNamespace) -
     state, covariance = (x[:1, :1].expand(2, 2, *x.shape[2:]) for x in (state, covariance))
     rows = torch.ones(2, 2, dtype=torch.bool)
     clouds = [
-        localizer.restarted(belief, rows, state, covariance).particles.flatten(0, 1)
+        localizer.restart_from(belief, rows, state, covariance).particles.flatten(0, 1)
         for belief in run.beliefs[1:]
     ]
     every = torch.cat(clouds)[..., 0]
@@ -171,11 +171,11 @@ def test_other_uavs_are_not_touched(name: str, tools: SimpleNamespace) -> None:
     kept = belief.clone()
     rows = torch.tensor([[True, False], [False, False]])
     state, covariance = gaussian(localizer)
-    found = localizer.restarted(belief, rows, state, covariance)
+    found = localizer.restart_from(belief, rows, state, covariance)
     tools.assert_same(belief, kept)
     for b, i in ((0, 1), (1, 0), (1, 1)):
         tools.assert_same(found[b : b + 1, i : i + 1], belief[b : b + 1, i : i + 1])
-    every = localizer.restarted(belief, torch.ones_like(rows), state, covariance)
+    every = localizer.restart_from(belief, torch.ones_like(rows), state, covariance)
     tools.assert_same(found[:1, :1], every[:1, :1])
     mean = localizer.mean(found)[0, 0] - localizer.mean(belief)[0, 0]
     assert mean[:3].abs().max() > 0.1
@@ -188,7 +188,7 @@ def test_adaptive_filters_begin_with_their_first_count(tools: SimpleNamespace) -
     assert (belief.count != 120).all()
     rows = torch.tensor([[True, False], [False, True]])
     state, covariance = gaussian(localizer)
-    found = localizer.restarted(belief, rows, state, covariance)
+    found = localizer.restart_from(belief, rows, state, covariance)
     assert (found.count[rows] == 120).all()
     assert torch.equal(found.count[~rows], belief.count[~rows])
     slot = torch.arange(found.log_weights.shape[-1])
@@ -328,7 +328,7 @@ def test_it_can_be_corrected_from_outside(main: str, tools: SimpleNamespace) -> 
     localizer = make(f"hpff:main={main}", scenario)
     belief = tools.play(localizer, scenario, [0, 1], 3).beliefs[-1]
     offset = torch.tensor([1.0, -2.0, 0.5]).expand(2, 2, 3)
-    moved = localizer.moved(belief, offset)
+    moved = localizer.shifted(belief, offset)
     apart = localizer.mean(moved) - localizer.mean(belief)
     torch.testing.assert_close(apart[..., :3].float(), offset, rtol=0, atol=1e-4)
     tools.assert_same(moved.auxiliary, belief.auxiliary)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from agents import make
-from agents.models.measurements import Block, heard, make_measurements
+from agents.models.measurements import Block, make_measurements, received
 from agents.models.process import make_process
 from agents.policies.adapters import ParallelPolicy
 from agents.robust import METHODS, Prediction, RobustScreen
@@ -153,7 +153,7 @@ def test_hypotheses_are_those_of_the_vectors_however_broad_the_prior(
     x[..., 4:] = world.truth.attitude
     broad = covariance.clone()
     broad[..., :2, :2] = 30.0 * torch.eye(2)
-    block = models[0].linearize(process, x, seen, heard(scenario.believed, seen))
+    block = models[0].linearize(process, x, seen, received(scenario.believed, seen))
     block.residual[:, :, FALSE, 1] += 1.5
     weights = consensus_weights(models[0], block, broad)
     false = torch.arange(block.mask.shape[-1]) == FALSE
@@ -182,7 +182,7 @@ def judged_twice(
     memory = temporal.memory(first)
 
     def blocks(o: Observation) -> list[Block]:
-        return [m.linearize(process, x, o, heard(scenario.believed, o)) for m in models]
+        return [m.linearize(process, x, o, received(scenario.believed, o)) for m in models]
 
     fresh = temporal.judge(blocks(first), Prediction(x, covariance, first, memory), memory)
     assert all((weight == 1).all() for weight in fresh)
@@ -298,7 +298,7 @@ def test_votes_are_those_of_every_triple(overrides: dict, trouble: dict) -> None
     process, models = make_process(scenario.believed), make_measurements(scenario.believed)
     seen = World(scenario, 3).reset(0)
     x, covariance = process.initial(seen["prior"].double())
-    neighbours = heard(scenario.believed, seen)
+    neighbours = received(scenario.believed, seen)
     blocks = [m.linearize(process, x, seen, neighbours) for m in models]
     prediction = Prediction(x, covariance, seen, seen["prior"][..., :0])
     found = CrossValidation(process, models).judge(blocks, prediction)
@@ -314,7 +314,7 @@ def test_without_landmarks_or_ranges_it_has_nothing_to_say(overrides: dict) -> N
     process, models = make_process(scenario.believed), make_measurements(scenario.believed)
     seen = World(scenario).reset(0)
     x, covariance = process.initial(seen["prior"].double())
-    blocks = [m.linearize(process, x, seen, heard(scenario.believed, seen)) for m in models]
+    blocks = [m.linearize(process, x, seen, received(scenario.believed, seen)) for m in models]
     prediction = Prediction(x, covariance, seen, seen["prior"][..., :0])
     assert CrossValidation(process, models).judge(blocks, prediction) == [None] * len(models)
     assert not make("ekf:robust=cross", scenario).exchanges
@@ -331,7 +331,7 @@ def test_only_what_a_link_carries_is_compared(tools: SimpleNamespace) -> None:
         links = seen["links"] * linked
         told = tools.change(seen, landmarks=landmarks, links=links)
         x, covariance = process.initial(told["prior"].double())
-        blocks = [m.linearize(process, x, told, heard(scenario.believed, told)) for m in models]
+        blocks = [m.linearize(process, x, told, received(scenario.believed, told)) for m in models]
         prediction = Prediction(x, covariance, told, told["prior"][..., :0])
         weights = CrossValidation(process, models).judge(blocks, prediction)[0]
         assert weights.sum() == weights.numel() - 2 * linked
@@ -367,7 +367,7 @@ def test_a_sensor_that_is_left_out_for_long_is_believed_again(tools: SimpleNames
     memory, kept = screen.memory(seen), []
     for _ in range(10):
         prediction = Prediction(x, sharp, seen, memory)
-        blocks = [m.linearize(process, x, seen, heard(scenario.believed, seen)) for m in models]
+        blocks = [m.linearize(process, x, seen, received(scenario.believed, seen)) for m in models]
         verdict = screen.judge(blocks, prediction)
         memory = screen.remember(prediction, verdict, list)
         kept.append(bool(verdict.weights[0].bool().all()))

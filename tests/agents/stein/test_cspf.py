@@ -161,7 +161,10 @@ def test_a_holder_without_inliers_restarts() -> None:
         ("cspf:outliers=1", "cspf: outliers='1' is not allowed: a number > 0 and < 1"),
         ("cspf:anneal=1.5", "cspf: anneal='1.5' is not allowed: a number > 0 and ≤ 1"),
         ("cspf:variant=better", "cspf: variant='better' is not allowed: one of settled"),
-        ("pf_joint:particles=1", "pf_joint: particles='1' is not allowed: a whole number ≥ 2"),
+        (
+            "pf_joint:particles=1",
+            "pf_joint: particles='1' is not allowed: a whole number from 2 to",
+        ),
         ("pose_graph:every=0", "pose_graph: every='0' is not allowed: a whole number ≥ 1"),
     ],
 )

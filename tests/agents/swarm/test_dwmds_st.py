@@ -226,7 +226,7 @@ def test_a_moved_belief_is_the_belief_of_a_moved_position(agent: str) -> None:
     observation = world.reset(0)
     belief, _ = localizer.step(localizer.reset(observation), observation)
     offset = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64).expand(1, SMALL["n_uavs"], 3)
-    moved = localizer.moved(belief, offset)
+    moved = localizer.shifted(belief, offset)
     torch.testing.assert_close(localizer.mean(moved)[..., :3] - localizer.mean(belief)[..., :3],
                                offset, rtol=0, atol=1e-9)  # fmt: skip
     (_, before), (_, after) = (localizer.step(x, observation) for x in (belief, moved))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from agents import make
-from agents.models.measurements import LandmarkVectors, UavRanges, heard
+from agents.models.measurements import LandmarkVectors, UavRanges, received
 from agents.particle.likelihood import log_likelihood
 from agents.robust import Trust
 from agents.trust.features import leave_one_out
@@ -160,7 +160,7 @@ def test_trust_enters_every_particle_alike(tools: SimpleNamespace) -> None:
     localizer: Any = make("apf", scenario)
     run = tools.play(localizer, scenario, [0, 1], 6)
     belief, seen = run.beliefs[5], run.observations[5]
-    near, centre = heard(scenario.believed, seen), belief.particles[..., 0, :]
+    near, centre = received(scenario.believed, seen), belief.particles[..., 0, :]
     models = localizer.models
     assert [type(m) for m in models] == [LandmarkVectors, UavRanges]
 

@@ -80,8 +80,8 @@ def test_no_part_has_gone() -> None:
 def test_watching_leaves_everything_as_it_was() -> None:
     scenario = make_scenario("indoor-v0", n_uavs=2)
     localizer: Any = make("pfnn", scenario)
-    before = particle_filter.normal, resampling.moments, localizer.renewal.weigh
+    before = particle_filter.normal, resampling.moments, localizer.resampling.weigh
     with _watching(localizer, Stopwatch()):
-        during = particle_filter.normal, resampling.moments, localizer.renewal.weigh
+        during = particle_filter.normal, resampling.moments, localizer.resampling.weigh
     assert all(one is not other for one, other in zip(before, during, strict=True))
-    assert (particle_filter.normal, resampling.moments, localizer.renewal.weigh) == before
+    assert (particle_filter.normal, resampling.moments, localizer.resampling.weigh) == before

@@ -1,28 +1,39 @@
-"""``coloc reproduce nnhpff``: figures of merit against scikit-learn, verdicts on made-up runs."""
+"""``coloc reproduce nnhpff``: the detector against scikit-learn, verdicts on made-up runs."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from made import Made, runs_of
 from sklearn import calibration as oracle
 from sklearn import metrics
 
 from agents import make
 from coloc_env.scenarios import make_scenario
-from training.evaluation.record import RunRecord
-from training.evaluation.results import Evaluation
-from training.reproduce.nnhpff import detection, plan
-from training.reproduce.nnhpff.claims import verdicts
-from training.reproduce.nnhpff.measures import HELD, Runs
-from training.reproduce.nnhpff.run import NAMES, reproduce
+from training.reproduce.measures import mean_error
+from training.reproduce.nnhpff import detection, nnhpff, plan
+from training.reproduce.nnhpff.claims import claims
+from training.reproduce.nnhpff.plan import (
+    HELD,
+    corner_peak,
+    first_reset,
+    recovery,
+    resets_per_run,
+    settled_error,
+)
+from training.reproduce.results import Runs
+from training.reproduce.settings import Settings
+from training.reproduce.study import reproduce
 from training.reproduce.verdicts import (
     CONTRADICTED,
     NOT,
     REPRODUCED,
     UNKNOWN,
     Difference,
+    Verdict,
     away_from_zero,
+    judge,
 )
 
 RUNS, STEPS = 12, 360
@@ -79,7 +90,7 @@ def test_calibration_is_scikit_learns() -> None:
     share, said = oracle.calibration_curve(failed, score, n_bins=detection.BINS)
     full = found.count > 0
     np.testing.assert_allclose(found.failed[full], share)
-    np.testing.assert_allclose(found.said[full], said)
+    np.testing.assert_allclose(found.probability[full], said)
     assert found.brier == pytest.approx(metrics.brier_score_loss(failed, score))
     weighted = (np.abs(said - share) * found.count[full]).sum() / found.count.sum()
     assert found.error == pytest.approx(weighted)
@@ -88,56 +99,49 @@ def test_calibration_is_scikit_learns() -> None:
 # ---------------------------------------------------------------- runs
 
 
-def flown(error: np.ndarray, resets: np.ndarray | None = None) -> Runs:
+def runs(error: np.ndarray, resets: np.ndarray | None = None) -> Runs:
     """An agent's runs with these errors [R, K] (m) and resets."""
-    error = error[..., None].astype(np.float32)
-    series = {} if resets is None else {"resets_per_run": resets[..., None].astype(np.float32)}
-    one = RunRecord(
-        offset=np.stack((error, 0 * error), -1),
-        error=error,
-        nees=np.full(error.shape, 2.0, np.float32),
-        broken=np.zeros(len(error), bool),
-        series=series,
-        ms_per_step=None,
-    )
-    scored = np.ones(error.shape, bool)
+    series = {} if resets is None else {"resets_per_run": resets[..., None]}
     scenario = make_scenario("wsn-v0", horizon=error.shape[1])
-    truth = np.zeros((*error.shape, 2))
-    return Runs(Evaluation(scenario, 0, truth, truth[0, :, :, :1], scored, None, {"x": one}), "x")
+    return runs_of(scenario, error[..., None], series=series, nees=2.0)
 
 
 def test_figures_of_a_run() -> None:
     error, resets = np.full((2, STEPS), 0.1), np.zeros((2, STEPS))
     error[:, :20], error[0, 120], error[1, 230] = 1.1, 0.9, 5.0
     resets[0, [3, 130, 140]] = 1
-    one = flown(error, resets)
-    assert one.ale() == pytest.approx(error.mean(1), abs=1e-6)
-    assert one.settled_ale() == pytest.approx(error[:, 20:].mean(1), abs=1e-6)
-    assert one.resets_per_run().tolist() == [3.0, 0.0]
-    assert one.corner_peak() == pytest.approx([0.9, 0.1])
-    assert one.first_reset().tolist() == [130.0, np.inf]
+    one = runs(error, resets)
+    assert mean_error(one) == pytest.approx(error.mean(1), abs=1e-6)
+    assert settled_error(one) == pytest.approx(error[:, 20:].mean(1), abs=1e-6)
+    assert resets_per_run(one).tolist() == [3.0, 0.0]
+    assert corner_peak(one) == pytest.approx([0.9, 0.1])
+    assert first_reset(one).tolist() == [130.0, np.inf]
 
 
 def test_recovery_counts_once_the_error_stays_small() -> None:
     error = np.full((3, STEPS), 2.0)
     error[0, 187:] = 0.1  # 7 steps after
     error[1, 183:185], error[1, 200:] = 0.1, 0.1  # small for a moment only, then at last
-    time = flown(error).recovery(180, slice(0, 1))[:, 0]
+    time = recovery(runs(error), 180, slice(0, 1))[:, 0]
     assert time == pytest.approx([0.7, 2.0, np.inf])
     assert HELD == 10
 
 
 def test_runs_that_end_before_the_corner_have_no_peak() -> None:
-    short = flown(np.full((2, 50), 0.1), np.ones((2, 50)))
-    assert np.isnan(short.corner_peak()).all()
-    assert np.isinf(short.first_reset()).all()
+    short = runs(np.full((2, 50), 0.1), np.ones((2, 50)))
+    assert np.isnan(corner_peak(short)).all()
+    assert np.isinf(first_reset(short)).all()
 
 
 # ---------------------------------------------------------------- verdicts
 
 
-def cases(better: bool) -> dict[tuple[int, str], Runs]:
-    """Runs as the paper tells of them, or the other way round."""
+def key(number: int, agent: str) -> tuple[str, str]:
+    return plan.case(number).key, agent
+
+
+def cases(better: bool) -> dict[tuple[str, str], Runs]:
+    """Runs as the paper describes them, or the other way round."""
     rng = np.random.default_rng(0)
     world = 0.1 * (1 + 0.05 * rng.random((RUNS, STEPS)))
     none, often = np.zeros((RUNS, STEPS)), np.ones((RUNS, STEPS))
@@ -148,32 +152,36 @@ def cases(better: bool) -> dict[tuple[int, str], Runs]:
     if not better:
         early, late = late, early
     return {
-        (1, "pf"): flown(world),
-        (1, "hpff"): flown(1.01 * world, late),
-        (1, "nnhpff"): flown(world, none),
-        (2, "pf"): flown(world),
-        (2, "hpff"): flown((1.5 if better else 0.5) * world, often if better else none),
-        (2, "nnhpff"): flown((1.01 if better else 1.5) * world, none if better else often),
-        (3, "pf"): flown(world + (1.0 if better else 0.1) * corner),
-        (3, "hpff"): flown(world + (0.71 if better else 1.5) * corner, late),
-        (3, "nnhpff"): flown(world + (0.7 if better else 1.7) * corner, early),
+        key(1, "pf"): runs(world),
+        key(1, "hpff"): runs(1.01 * world, late),
+        key(1, "nnhpff"): runs(world, none),
+        key(2, "pf"): runs(world),
+        key(2, "hpff"): runs((1.5 if better else 0.5) * world, often if better else none),
+        key(2, "nnhpff"): runs((1.01 if better else 1.5) * world, none if better else often),
+        key(3, "pf"): runs(world + (1.0 if better else 0.1) * corner),
+        key(3, "hpff"): runs(world + (0.71 if better else 1.5) * corner, late),
+        key(3, "nnhpff"): runs(world + (0.7 if better else 1.7) * corner, early),
     }
 
 
+def judged(found: dict[tuple[str, str], Runs]) -> list[Verdict]:
+    return judge(claims(Settings(Path("x"), RUNS)), Made(found))
+
+
 def test_the_papers_own_figures_bear_out_its_claims() -> None:
-    assert {each.verdict for each in verdicts(cases(True))} == {REPRODUCED}
+    assert {each.verdict for each in judged(cases(True))} == {REPRODUCED}
 
 
 def test_the_opposite_contradicts_them() -> None:
-    judged = {each.claim.words: each.verdict for each in verdicts(cases(False))}
-    of_two_and_three = {w: v for w, v in judged.items() if not w.startswith("case 1")}
+    words = {each.claim.words: each.verdict for each in judged(cases(False))}
+    of_two_and_three = {w: v for w, v in words.items() if not w.startswith("case 1")}
     assert set(of_two_and_three.values()) <= {CONTRADICTED, NOT}
     assert list(of_two_and_three.values()).count(CONTRADICTED) >= 8
 
 
-def test_what_was_not_flown_is_not_judged() -> None:
-    some = {key: one for key, one in cases(True).items() if key[1] != "nnhpff"}
-    for each in verdicts(some):
+def test_what_was_not_run_is_not_judged() -> None:
+    some = {k: one for k, one in cases(True).items() if k[1] != "nnhpff"}
+    for each in judged(some):
         assert (each.verdict == UNKNOWN) == ("NN-HPFF" in each.claim.words)
 
 
@@ -189,37 +197,33 @@ def test_the_size_of_a_difference(low: float, high: float, expected: tuple[float
 # ---------------------------------------------------------------- the plan, and all of it at once
 
 
-def test_every_scenario_of_the_plan_can_be_built() -> None:
-    simulated = (*plan.sensitivity(None), *plan.kidnapping(None), *plan.blocked(None))
-    for variant, agents in simulated:
-        for agent in agents:
-            make(agent, variant.build())
-    for variant, agent in (*plan.trained_on(None), *plan.never_seen(None)):
-        make(agent, variant.build())
-    assert len(plan.trained_on(None)) == 27
+def test_every_scenario_of_the_plan_can_be_built(tmp_path: Path) -> None:
+    settings = Settings(tmp_path, 1)
+    for cell in (*plan.paper(settings), *plan.detector(settings), *plan.beyond(settings)):
+        if not cell.variant.scenario.startswith("replay"):
+            for agent in cell.agents:
+                make(agent, cell.variant.build())
+    assert len(plan.trained_on()) == 27
 
 
-def quiet(*_: Any) -> None:
-    """Tells nobody."""
-
-
-def test_a_small_report(tmp_path: Path) -> None:
-    where = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
-    small: dict[str, Any] = {"runs": 2, "seed": 0, "where": where, "steps": 25, "jobs": 1}
-    reproduce(tmp_path, "all", missing=True, tell=quiet, note=quiet, **small)
-    text = (tmp_path / "report.md").read_text()
+def test_a_small_page(tmp_path: Path) -> None:
+    variants = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
+    agents = ["pf", "hpff", "nnhpff", "nnhpff:main=pf@particles=500:threshold=1"]
+    chosen: dict[str, Any] = {"agents": agents, "variants": variants, "steps": 25}
+    reproduce(nnhpff(), Settings(tmp_path, 2, **chosen))
+    text = (tmp_path / "page.md").read_text()
     assert "14 claims" in text
     assert "| case 1: noise known" in text
-    assert "the 27 scenarios, other worlds" in text
-    for name in ("figure_5_case_1.png", "figure_8_ale.png", "paper.json"):
+    assert "| the 27 scenarios, other worlds | network | 25 |" in text
+    for name in ("figure_5_case_1.png", "figure_8_ale.png"):
         assert (tmp_path / name).exists()
-        assert name in NAMES
     stored = sorted(file.stat().st_mtime for file in (tmp_path / "store").rglob("*.npz"))
-    reproduce(tmp_path, "all", missing=False, tell=quiet, note=quiet, **small)
-    assert (tmp_path / "report.md").read_text() == text
+    reproduce(nnhpff(), Settings(tmp_path, 2, report_only=True, **chosen))
+    assert (tmp_path / "page.md").read_text() == text
     assert stored == sorted(file.stat().st_mtime for file in (tmp_path / "store").rglob("*.npz"))
 
 
-def test_unknown_variants_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="unknown variant 'case9'"):
-        reproduce(tmp_path, "paper", 2, 0, ["case9"], 20, 1, True, quiet, quiet)
+def test_figure_4_is_trained_with_the_whole_study_only(tmp_path: Path) -> None:
+    assert [t.key for t in plan.trainings(Settings(tmp_path, 1))] == ["nnhpff"]
+    assert not list(plan.trainings(Settings(tmp_path, 1, steps=9)))
+    assert not list(plan.trainings(Settings(tmp_path, 1, variants=["case1"])))

@@ -2,26 +2,39 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from made import Made, runs_of
 from typer.testing import CliRunner, Result
 
 from coloc_env.bounds import Bound
 from coloc_env.scenarios import make_scenario
 from training.cli.command import app
-from training.evaluation.record import RunRecord, Worlds
-from training.evaluation.results import Evaluation
+from training.evaluation.record import Worlds
 from training.reproduce.cost import Cost
-from training.reproduce.pfnn import goals, paper, report, robustness, tables
-from training.reproduce.pfnn.claims import verdicts
-from training.reproduce.pfnn.flown import Flown
-from training.reproduce.pfnn.in_flight import InFlight
-from training.reproduce.pfnn.plan import TABLE_AGENTS, ablation_agents, default, variants
-from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, Verdict
+from training.reproduce.measures import rmse
+from training.reproduce.pfnn import paper, plan, robustness, tables
+from training.reproduce.pfnn.claims import claims
+from training.reproduce.pfnn.plan import ABLATION, ONLINE, TABLE_AGENTS, Online
+from training.reproduce.results import Runs
+from training.reproduce.settings import Settings
+from training.reproduce.tables import Table
+from training.reproduce.verdicts import (
+    CONTRADICTED,
+    MET,
+    MISSED,
+    NOT,
+    REPRODUCED,
+    UNKNOWN,
+    Verdict,
+    judge,
+    judge_goals,
+)
+from training.reproduce.work import WORLD
 
 RUNS, STEPS = 10, 150
 PAPERS = {  # errors as the paper has them, in m: what would bear out its claims
@@ -30,50 +43,63 @@ PAPERS = {  # errors as the paper has them, in m: what would bear out its claims
     "apf": 0.481,
     "ekf": 0.687,
     "pfnn": 0.437,
-} | {agent: 0.5 for agent in ablation_agents() if agent != "pfnn"}
+} | {agent: 0.5 for agent in ABLATION if agent != "pfnn"}
 SERIES = {"particles": 790.0, "ess_share": 0.45}
 
 
-def made(size: Mapping[str, float], series: Mapping[str, float] = SERIES) -> Evaluation:
+SETTINGS = Settings(Path("x"), RUNS)
+
+
+def made(size: Mapping[str, float], series: Mapping[str, float] = SERIES) -> dict[str, Runs]:
     """Agents whose errors have these sizes (m), alike but for 2 % from run to run; particle filters
-    with these figures of their own."""
+    with these series of their own."""
     rng = np.random.default_rng(0)
-    scenario = make_scenario("indoor-v0", horizon=STEPS)
-    shape = (RUNS, STEPS, 6)
+    scenario, shape = make_scenario("indoor-v0", horizon=STEPS), (RUNS, STEPS, 6)
     world = rng.uniform(0.8, 1.2, size=(RUNS, 1, 1)) * rng.uniform(0.5, 1.3, size=shape)
     scored = torch.ones(shape, dtype=torch.bool)
     worlds = Worlds(0, np.full((*shape, 3), 5.0), np.zeros((STEPS, 6, 4)), scored.numpy())
-    agents = {}
+    bound = Bound(torch.full(shape, 0.034**2, dtype=torch.float64), scored, 0.1)
+    found = {}
     for name, scale in size.items():
         error = scale * world * (1 + 0.02 * rng.normal(size=(RUNS, 1, 1)))
-        own = {} if name.startswith("ekf") else series
-        agents[name] = RunRecord(
-            worlds=worlds,
-            offset=np.stack((error, 0 * error, 0 * error), -1).astype(np.float32),
-            error=error.astype(np.float32),
-            nees=np.full(shape, 3.0, np.float32),
-            broken=np.zeros(RUNS, bool),
-            series={key: np.full(shape, value, np.float32) for key, value in own.items()},
-            ms_per_step=None,
-        )
-    bound = Bound(torch.full(shape, 0.034**2, dtype=torch.float64), scored, 0.1)
-    return Evaluation(scenario, worlds, bound, agents)
+        own = {} if name.startswith("ekf") else {k: np.full(shape, v) for k, v in series.items()}
+        found[name] = runs_of(scenario, error, name, own, bound, worlds=worlds)
+    return found
 
 
-def flown(size: Mapping[str, float] = PAPERS, series: Mapping[str, float] = SERIES) -> Flown:
-    results = made(size, series)
+class Study(Made):
+    """Results of all cells alike."""
+
+    settings = SETTINGS
+
+    def runs(self, name: str, agents: Any = None) -> dict[str, Runs]:
+        every = [key[0] for key in self.usual if len(key) == 1] if agents is None else agents
+        there = {agent: self.get(name, agent) for agent in every}
+        return {agent: one for agent, one in there.items() if one is not None}
+
+    def __getitem__(self, what: tuple[str, str]) -> Any:
+        return self.get(*what)
+
+
+def study(size: Mapping[str, float] = PAPERS, series: Mapping[str, float] = SERIES) -> Study:
+    there = made(size, series)
     rng = np.random.default_rng(1)
-    cost = {
-        name: Cost(row.ms.mean + rng.normal(size=STEPS), 10**6, round(1e6 * row.memory))
+    usual: dict[Any, Any] = {(name,): one for name, one in there.items()}
+    usual |= {
+        (name, "cost"): Cost(row.ms.mean + rng.normal(size=STEPS), 10**6, round(1e6 * row.memory))
         for name, row in paper.TABLE_5.items()
         if name in size
     }
     loss = 0.04 + 0.11 * np.exp(-np.arange(60) / 10) + 0.002 * rng.normal(size=(RUNS, 60))
-    learning = None
     if "pfnn" in size:
-        learning = InFlight(results.agents["pfnn"].error, np.full((RUNS, STEPS, 6), 700.0), loss)
-    methods = {name: one for name, one in results.agents.items() if name in TABLE_AGENTS}
-    return Flown(results, replace(results, agents=methods), cost, learning)
+        count = np.full((RUNS, STEPS, 6), 700.0)
+        usual["pfnn", ONLINE.label] = Online(there["pfnn"].error, count, loss)
+    usual[WORLD,] = next(iter(there.values()))
+    return Study({}, usual)
+
+
+def judged_of(size: Mapping[str, float] = PAPERS, series: Any = SERIES) -> list[Verdict]:
+    return judge(claims(SETTINGS), study(size, series))
 
 
 def about(judged: list[Verdict], *words: str) -> Verdict:
@@ -84,7 +110,7 @@ def about(judged: list[Verdict], *words: str) -> Verdict:
 
 @pytest.fixture(scope="module")
 def as_printed() -> list[Verdict]:
-    return verdicts(flown())
+    return judged_of()
 
 
 def test_the_papers_own_numbers_bear_out_its_comparisons(as_printed: list[Verdict]) -> None:
@@ -119,10 +145,10 @@ def test_its_table_contradicts_its_text(as_printed: list[Verdict]) -> None:
         assert (found.verdict, found.reason) == (CONTRADICTED, "the opposite holds")
 
 
-def test_what_was_not_flown_is_not_measured(as_printed: list[Verdict]) -> None:
+def test_what_was_not_run_is_not_measured(as_printed: list[Verdict]) -> None:
     found = about(as_printed, "D-LSPF")
-    assert (found.verdict, found.ours, found.reason) == (UNKNOWN, None, "not flown: dlspf")
-    judged = verdicts(flown({"pf500": 0.6, "ekf": 0.7}))
+    assert (found.verdict, found.ours, found.reason) == (UNKNOWN, None, "not run: dlspf in default")
+    judged = judged_of({"pf500": 0.6, "ekf": 0.7})
     assert len(judged) == len(as_printed)
     kinds = {v.claim.words: v.verdict for v in judged}
     assert kinds.pop("Standard PF (N = 500)'s RMSE is below that of EKF Cooperative") == REPRODUCED
@@ -131,7 +157,7 @@ def test_what_was_not_flown_is_not_measured(as_printed: list[Verdict]) -> None:
 
 
 def test_no_effect_is_not_reproduced() -> None:
-    judged = verdicts(flown(PAPERS | {"pfnn": 0.481} | dict.fromkeys(ablation_agents(), 0.481)))
+    judged = judged_of(PAPERS | {"pfnn": 0.481} | dict.fromkeys(ABLATION, 0.481))
     found = about(judged, "PF-NN's RMSE is below that of Adaptive PF (no NN)")
     assert found.ours is not None
     assert found.ours.low < 0 < found.ours.high
@@ -141,7 +167,7 @@ def test_no_effect_is_not_reproduced() -> None:
 
 def test_the_opposite_contradicts() -> None:
     small = dict.fromkeys(PAPERS, 0.035) | {"ekf": 0.030, "pfnn:correction=0.2,1": 0.033}
-    judged = verdicts(flown(small, {"particles": 300.0, "ess_share": 0.9}))
+    judged = judged_of(small, {"particles": 300.0, "ess_share": 0.9})
     for words in (
         "PF-NN's RMSE is below that of EKF",
         "PF-NN is the best",
@@ -157,44 +183,44 @@ def test_the_opposite_contradicts() -> None:
     assert about(judged, "medians are below 0.2 m").verdict == REPRODUCED
 
 
-def test_a_smaller_gain_is_told_as_such() -> None:
-    judged = verdicts(flown(PAPERS | {"pf500": 1.1 * 0.437}))
+def test_a_smaller_gain_is_called_so() -> None:
+    judged = judged_of(PAPERS | {"pf500": 1.1 * 0.437})
     found = about(judged, "PF-NN's RMSE is below that of Standard PF")
     assert (found.verdict, found.reason) == (NOT, "same direction, but smaller")
 
 
-def cells(table: tables.Table, name: str) -> dict[str, str]:
+def cells(table: Table, name: str) -> dict[str, str]:
     """A table's line by its first cell."""
-    header, lines = table
+    header, lines = table.header, table.rows
     assert all(len(line) == len(header) for line in lines)
     (line,) = [line for line in lines if line[0] == name and "flight" not in line[1]]
     return dict(zip(header, line, strict=True))
 
 
 def test_tables_have_both_sides() -> None:
-    run = flown(PAPERS | {"pfnn": 0.0351})
-    four = cells(tables.table_4(run), "Proposed PF-NN")
+    run: Any = study(PAPERS | {"pfnn": 0.0351})
+    four = cells(tables._table_4(run), "Proposed PF-NN")
     assert four["RMSE, paper"] == "0.437 ± 0.048"
-    rmse = run.rmse("pfnn")
-    assert four["RMSE, ours"] == f"{rmse.mean():.3g} ± {rmse.std(ddof=1):.3g}"
+    errors = rmse(run.get("default", "pfnn"))
+    assert four["RMSE, ours"] == f"{errors.mean():.3g} ± {errors.std(ddof=1):.3g}"
     assert (four["max, paper"], four["particles, paper"]) == ("6.91 ± 1.12", "720 ± 95")
     assert four["particles, ours"] == "790 ± 0"
-    later = cells(tables.table_4(run), "DFGO")
+    later = cells(tables._table_4(run), "DFGO")
     assert (later["RMSE, paper"], later["RMSE, ours"]) == ("0.398 ± 0.041", "–")
-    assert cells(tables.table_4(run), "EKF Cooperative")["particles, paper"] == "N/A"
-    assert cells(tables.table_4(run), "*posterior bound*")["RMSE, ours"].startswith("0.034")
-    three = cells(tables.table_3(run), "UAV-4")
+    assert cells(tables._table_4(run), "EKF Cooperative")["particles, paper"] == "N/A"
+    assert cells(tables._table_4(run), "*posterior bound*")["RMSE, ours"].startswith("0.034")
+    three = cells(tables._table_3(run), "UAV-4")
     assert (three["RMSE, paper"], three["max, paper"]) == ("0.535", "10.385")
-    own = np.sqrt((run.error("pfnn")[:, :, 3].astype(float) ** 2).mean(1))
+    own = np.sqrt((run.get("default", "pfnn").error[:, :, 3].astype(float) ** 2).mean(1))
     assert three["RMSE, ours"].startswith(f"{own.mean():.3g} ±")
-    average = cells(tables.table_3(run), "Average")
+    average = cells(tables._table_3(run), "Average")
     assert (average["RMSE, paper"], average["mean, paper"]) == ("0.437", "0.189")
-    _, lines = tables.table_5(run)
+    lines = tables._table_5(run).rows
     line = next(line for line in lines if line[1] == "`pfnn`")
     assert line[2] == "63.4 ± 6.7"
     assert line[3].startswith("63.")
     assert (line[6], line[7], line[8]) == ("178", "1.000", "178.00")
-    _, lines = tables.figure_2(run)
+    lines = tables._figure_2(run).rows
     assert [line[0] for line in lines] == [f"[{a}, {b}]" for a, b in paper.RANGES]
     assert next(line for line in lines if line[1] == "`pfnn`")[3] == "–"
 
@@ -209,88 +235,75 @@ def test_the_papers_numbers_are_consistent_with_what_it_says() -> None:
 
 # ------------------------------------------------------------------ robustness
 
-
-def hard(size: Mapping[str, float]) -> dict[str, robustness.Cell]:
-    results = made(size)
-    return {agent: robustness.Cell(results, agent) for agent in results.agents}
-
-
 SIZES = {"apf": 0.08, "ekf:robust=huber": 0.05, "ekf:robust=gate": 0.04}
 TRUST = {"pf_trust": 0.035, "pf_trust:weights=b": 0.06}
 
 
-def outcome(found: robustness.Cells, agent: str, *words: str) -> goals.Outcome:
-    judged = goals.outcomes(found, [*SIZES, *TRUST])
-    (one,) = [o for o in judged if o.agent == agent and all(w in o.goal.words for w in words)
-              and o.goal.variant == "few-nlos"]  # fmt: skip
-    return one
+def goals(found: dict[str, Runs], agents: tuple[str, ...], where: str) -> dict[str, Verdict]:
+    """Verdicts by the goals' words, of one variant."""
+    there = Made({(where, agent): one for agent, one in found.items()})
+    settings = Settings(Path("x"), RUNS, agents=agents)
+    every = [g for g in robustness.goals(settings) if g.needs[0][0] == where]
+    return {v.claim.words: v for v in judge_goals(every, there)}
 
 
 def test_goals_are_judged_for_every_training_of_an_agent() -> None:
-    found = {"few-nlos": hard(SIZES | TRUST)}
-    good, bad = TRUST
-    assert outcome(found, good, "RMSE ≤ 0.85 ×").verdict == goals.MET
-    assert outcome(found, good, "typically ≤ 0.85").verdict == goals.MET
-    assert outcome(found, bad, "typically ≤ 0.85").verdict == goals.MISSED
-    assert outcome(found, good, "below", "interval").verdict == goals.MET
-    assert outcome(found, good, "not worse").verdict == goals.MET
-    assert outcome(found, bad, "RMSE ≤ 0.85 ×").verdict == goals.MISSED
-    assert outcome(found, bad, "below", "interval").verdict == goals.MISSED
-    assert outcome(found, bad, "not worse").verdict == goals.MISSED
-    assert outcome(found, bad, "none lost").found == "0 of 10 runs"
-    elsewhere = [o for o in goals.outcomes(found, list(TRUST)) if o.goal.variant != "few-nlos"]
-    assert {o.verdict for o in elsewhere} == {goals.UNKNOWN}
+    judged = goals(made(SIZES | TRUST), (*SIZES, *TRUST), "few-nlos")
+    huber, gate = "`ekf:robust=huber`", "`ekf:robust=gate`"
+    expected = {
+        f"RMSE as a multiple of that of {huber}": (MET, MISSED),
+        f"typical ratio, interval and all, to {huber}": (MET, MISSED),
+        f"RMSE below that, interval and all, of {huber}": (MET, MISSED),
+        f"RMSE not worse than that of {gate}": (MET, MISSED),
+        "no run lost": (MET, MET),
+    }
+    for words, verdicts in expected.items():
+        found = [judged[f"`{agent}`, 5 landmarks + NLOS: {words}"].verdict for agent in TRUST]
+        assert tuple(found) == verdicts, words
+    assert len(judged) == 2 * len(expected)
 
 
 def test_a_goal_without_its_rival_is_not_measured() -> None:
-    found = {"few-nlos": hard({"pf_trust": 0.03})}
-    one = outcome(found, "pf_trust", "RMSE ≤ 0.85 ×")
-    assert (one.verdict, one.found) == (goals.UNKNOWN, "not flown: `ekf:robust=huber`")
+    judged = goals(made({"pf_trust": 0.03}), ("pf_trust",), "few-nlos")
+    one = judged["`pf_trust`, 5 landmarks + NLOS: RMSE as a multiple of that of `ekf:robust=huber`"]
+    assert (one.verdict, one.reason) == (UNKNOWN, "not run: ekf:robust=huber in few-nlos")
 
 
 def test_limits_of_one_figure() -> None:
-    found = {"default": hard({"apf": 0.03, "pfnn": 0.05})}
-    judged = {
-        o.agent: o.verdict
-        for o in goals.outcomes(found, ["apf", "pfnn"])
-        if o.goal.figure == "rmse_after_10s" and o.goal.variant == "default"
-    }
-    assert judged == {"apf": goals.MET, "pfnn": goals.MISSED}
+    judged = goals(made({"apf": 0.03, "pfnn": 0.05}), ("apf", "pfnn"), "default")
+    assert judged["`apf`, default: steady RMSE"].verdict == MET
+    assert judged["`pfnn`, default: steady RMSE"].verdict == MISSED
 
 
-def test_robust_tables_and_figures(tmp_path: Path) -> None:
-    few = [variant for variant in variants() if variant.key in ("default", "few-nlos")]
-    found = {variant.key: hard(SIZES | TRUST) for variant in few}
-    del found["default"]["apf"]
-    agents = [*SIZES, *TRUST]
-    bounds = {"default": 0.034, "few-nlos": None}
-    text = "\n".join(report.robust_part(found, bounds, few, agents, tmp_path))
-    names = ("robustness.csv", "robustness.json", "robustness.md", "robustness.png")
-    assert {path.name for path in tmp_path.iterdir()} == {*names, "robustness_paired.png"}
-    content = json.loads((tmp_path / "robustness.json").read_text())
-    assert len(content["rows"]) == 9
-    row = next(r for r in content["rows"] if r["agent"] == "pf_trust" and r["bound"] is None)
-    cell = found["few-nlos"]["pf_trust"]
-    other = found["few-nlos"]["ekf:robust=huber"]
-    assert row["rmse"] == pytest.approx(cell.figures["rmse"])
-    assert row["minus ekf:robust=huber"] == pytest.approx((cell.rmse - other.rmse).mean())
-    assert row["minus ekf:robust=huber, low"] < row["minus ekf:robust=huber"] < 0
-    assert "| 5 landmarks + NLOS | – |" in text
-    assert f"**{cell.figures['rmse']:.3g}**" in text
-    lines = (tmp_path / "robustness.csv").read_text().splitlines()
-    assert len(lines) == 10
-    assert lines[0].startswith("variant,title,agent,runs,bound,rmse,")
+def test_robust_tables_and_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = study(SIZES | TRUST)
+    found.settings = Settings(Path("x"), RUNS, agents=(*SIZES, *TRUST))
+    few = [v for v in plan.variants() if v.key in ("default", "few-nlos")]
+    monkeypatch.setattr(robustness, "variants", lambda: few)
+    *matrices, whole = robustness.tables(found)  # type: ignore[arg-type]
+    assert [len(table.rows) for table in matrices] == [2] * 5
+    one, other = found["few-nlos", "pf_trust"], found["few-nlos", "ekf:robust=huber"]
+    error = one.summary["rmse"]
+    assert f"**{error:.3g}**" in matrices[0].rows[1]
+    assert matrices[0].rows[1][:2] == ["5 landmarks + NLOS", "0.034"]
+    assert len(whole.rows) == 10
+    row = dict(zip(whole.header, whole.rows[8], strict=True))
+    assert (row["agent"], row["RMSE (m)"], row["runs"]) == ("`pf_trust`", f"{error:.3g}", "10")
+    mean = (rmse(one) - rmse(other)).mean()
+    assert row["minus `ekf:robust=huber` (95 %)"].startswith(f"−{-mean:.2g} (")
+    assert robustness.heat_map(found) is not None  # type: ignore[arg-type]
+    assert robustness.forest(found) is not None  # type: ignore[arg-type]
 
 
 def test_variants_are_unlike_and_build() -> None:
-    every = variants(steps=7)
+    every = plan.variants(steps=7)
     assert len({variant.key for variant in every}) == len(every)
     simulated = [variant for variant in every if variant.scenario == "indoor-v0"]
     assert len({variant.overrides for variant in simulated}) == len(simulated)
     for variant in simulated:
         assert variant.build().horizon == 7
-    assert {goal.variant for goal in goals.goals()} <= {variant.key for variant in every}
-    assert every[0] == default(7)
+    runs = {cell.variant.key: cell.runs for cell in plan.robustness(Settings(Path("x"), 20))}
+    assert (runs["hard"], runs["helix"], runs["mrclam"]) == (20, 10, 5)
 
 
 # ------------------------------------------------------------------ the command
@@ -307,32 +320,45 @@ def test_the_paper_part(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert f"written to {out}" in done.stdout
     assert "6/6 default/ekf-2+1" in done.stderr
-    text = (out / "report.md").read_text()
-    content = json.loads((out / "paper.json").read_text())
+    text = (out / "page.md").read_text()
+    content = json.loads((out / "results.json").read_text())
     assert "0.612 ± 0.089" in text
-    assert content["agents"].keys() == {"pf500", "ekf"}
-    assert content["cost"]["pf500"]["working_set_bytes"] > content["cost"]["ekf"]["belief_bytes"]
-    claims = {claim["claim"]: claim for claim in content["claims"]}
-    assert claims["PF-NN's RMSE"]["verdict"] == UNKNOWN
+    assert content["figures"]["default"]["agents"].keys() == {WORLD, "pf500", "ekf"}
+    costs = content["costs"]["default"]
+    assert costs["pf500"]["working_set_bytes"] > costs["ekf"]["belief_bytes"]
+    verdicts = {claim["claim"]: claim["verdict"] for claim in content["claims"]}
+    assert verdicts["PF-NN's RMSE"] == UNKNOWN
     assert [path.name for path in out.glob("*.png")] == ["figure_9_cdf.png"]
     assert "](figure_9_cdf.png)" in text
-    again = coloc(*arguments, "--agents", "ekf,pf500")
+    again = coloc(*arguments, "--agents", "ekf,pf500", "--report-only")
     assert again.exit_code == 0
-    assert again.stderr == ""  # nothing to fly
-    fresh = coloc(*arguments, "--agents", "ekf", "--fresh")
-    assert fresh.exit_code == 0
-    assert "4/4" in fresh.stderr
+    page = tmp_path / "docs" / "pfnn.md"
+    page.parent.mkdir()
+    done = coloc("--out", out, "--page", page)
+    assert done.exit_code == 0, done.output
+    assert "](../out/figure_9_cdf.png)" in page.read_text()
+    assert page.read_text().replace("../out/", "") == (out / "page.md").read_text()
+
+
+def test_figures_2_to_8(monkeypatch: pytest.MonkeyPatch) -> None:
+    from training.reproduce.pfnn.figures import FIGURES
+
+    found: Any = study({agent: PAPERS[agent] for agent in (*TABLE_AGENTS, *ABLATION)})
+    assert [name for name, drawing in FIGURES.items() if drawing(found) is None] == []
+    assert {name for name, drawing in FIGURES.items() if drawing(Study({})) is None} == set(FIGURES)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--agents", "ekff"], "did you mean 'ekf'"),
-        (["--agents", "test_still", "--part", "paper"], "none of the paper's"),
+        (["--agents", "test_still", "--part", "paper"], "is not in this study: pf500, pf800"),
         (["--runs", "0"], "--runs 0"),
         (["--jobs", "0"], "--jobs 0"),
-        (["--steps", "0"], "--steps 0"),
         (["--seed", "-1"], "--seed -1"),
+        (["--part", "campus"], "pfnn has no part 'campus': paper, robustness, all are allowed"),
+        (["--report-only"], "holds nothing yet: run without --report-only first"),
+        (["--page", "x.md"], "results.json does not exist: run the study first"),
     ],
 )
 def test_one_clear_line(arguments: list[str], words: str, tmp_path: Path) -> None:
@@ -342,3 +368,18 @@ def test_one_clear_line(arguments: list[str], words: str, tmp_path: Path) -> Non
     assert done.stderr.count("\n") == 1
     assert words in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_studies_are_named(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["reproduce", "pfn", "--out", str(tmp_path)])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "unknown study 'pfn' (did you mean 'pfnn'?)" in done.stderr
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", "[" * 100_000, '{"study": 1'])
+def test_what_is_no_results_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text(content)
+    done = coloc("--out", tmp_path, "--page", tmp_path / "x.md")
+    assert done.exit_code == 2
+    assert "results.json holds no results of a study" in done.stderr
+    assert done.stderr.count("\n") == 1

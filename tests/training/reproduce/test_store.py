@@ -11,8 +11,9 @@ from torch import nn
 from agents.localizer import Localizer
 from agents.registry import make
 from coloc_env.scenarios import make_scenario
-from training.reproduce import identity
+from training.reproduce import identity, work
 from training.reproduce.store import Store
+from training.reproduce.work import Piece, Variant
 
 SETTINGS = {"agent": "ekf:robust=huber", "seed": 0, "overrides": {"room": (30.0, 20.0, 5.0)}}
 
@@ -56,19 +57,57 @@ def test_mixed_settings_are_refused(store: Store) -> None:
         store.load("nlos/ekf:robust=huber-0+2", other)
 
 
-def test_damage_is_told(store: Store) -> None:
-    path = save(store)
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(ValueError, match=re.escape(f"{path.name} is damaged")):
-        store.load("nlos/ekf:robust=huber-0+2", SETTINGS)
+def _mutated(content: bytes, rng: np.random.Generator) -> bytes:
+    """Bits flipped, a part cut off, doubled, zeroed or overwritten, or nothing left."""
+    data, n = bytearray(content), len(content)
+    a, b = sorted(rng.integers(0, n, 2).tolist())
+    kind = rng.integers(7)
+    if kind == 0:
+        data[a] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        del data[a:]
+    elif kind == 2:
+        del data[a : b + 1]
+    elif kind == 3:
+        data[b:b] = data[a : b + 1]
+    elif kind == 4:
+        data[a : b + 1] = bytes(b + 1 - a)
+    elif kind == 5:
+        size = min(64, n - a)
+        data[a : a + size] = rng.bytes(size)
+    else:
+        return b"" if a % 2 else b"PK\x03\x04" + rng.bytes(50)
+    return bytes(data)
+
+
+def test_damaged_files_are_never_taken(store: Store) -> None:
+    path, name = save(store), "nlos/ekf:robust=huber-0+2"
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(250):
+        damaged = _mutated(whole, rng)
+        if damaged == whole:
+            continue
+        path.write_bytes(damaged)
+        assert not store.has(name, SETTINGS)  # so it is computed again
+        with pytest.raises(ValueError, match=re.escape(f"{path.name} is damaged")) as error:
+            store.load(name, SETTINGS)
+        assert "\n" not in str(error.value)
+    path.write_bytes(whole)
+    assert store.has(name, SETTINGS)
+
+
+def test_numpy_reads_the_files_too(store: Store) -> None:
+    with np.load(save(store)) as file:
+        np.testing.assert_array_equal(file["error"], [[0, 1, 2], [3, 4, 5]])
 
 
 def test_nothing_is_ever_half_written(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(file: Path, **arrays: object) -> None:
-        file.write_bytes(b"half of it")
+    def full(path: Path, content: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(content[:100])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(KeyboardInterrupt):
         save(store)
     assert not store.has("nlos/ekf:robust=huber-0+2", SETTINGS)
@@ -97,7 +136,7 @@ def test_code_of_what_is_imported_counts(tmp_path: Path) -> None:
     names = {file.name for file in imports}
     assert "localizer.py" in names
     assert "torch" not in {file.parent.name for file in imports}
-    assert "__init__.py" not in names  # agents/ only registers
+    assert "__init__.py" not in names  # agents and coloc_env only register
     assert "Hash of the code" not in code
 
 
@@ -105,13 +144,57 @@ def test_agents_share_no_more_than_they_use() -> None:
     room = make_scenario("indoor-v0", anchors=4)
 
     def code(agent: str, *modules: str) -> str:
-        return identity.code_of(make(agent, room), *modules)
+        return identity.code_of("indoor-v0", [make(agent, room)], modules)
 
     assert code("ekf") == code("ekf:robust=huber")
     assert code("ekf") != code("pf500")
     assert code("ekf") != code("ekf", "training.learning.pfnn_online")
     assert code("hpff") != code("hpff:main=ekf")  # what it is made of counts
     assert code("hpff") == code("hpff:main=pf500")
+
+
+INDOOR, SWARM = "coloc_env/scenarios/indoor.py", "coloc_env/scenarios/swarm.py"
+
+
+@pytest.mark.parametrize(
+    ("file", "scenario", "agent", "counts"),
+    [
+        (INDOOR, "indoor-v0", "ekf", True),
+        (SWARM, "indoor-v0", "ekf", False),
+        (INDOOR, "swarm-v0", "dwmds_st", False),
+        (SWARM, "swarm-v0", "dwmds_st", True),
+        ("coloc_env/world.py", "indoor-v0", "ekf", True),
+        ("coloc_env/envs/sb3.py", "indoor-v0", "ekf", False),
+        ("agents/kalman/ekf.py", "indoor-v0", "hpff:main=ekf", True),  # the main filter
+        ("agents/kalman/emvf.py", "indoor-v0", "hpff:main=ekf", True),  # the auxiliary
+        ("agents/kalman/ekf.py", "indoor-v0", "pf500", False),
+        ("agents/policies/learned.py", "indoor-v0", "mappo", True),
+        ("agents/kalman/ekf.py", "indoor-v0", "mappo", True),  # the policy's base
+        ("agents/swarm/dwmds_st.py", "swarm-v0", "stdcl", True),  # the optimizer in the loop
+        ("training/evaluation/record.py", "indoor-v0", "ekf", True),
+        ("training/evaluation/figures.py", "indoor-v0", "ekf", False),
+        ("training/reproduce/tables.py", "indoor-v0", "ekf", False),
+    ],
+)
+def test_a_piece_depends_on_its_family_and_its_localizers(
+    file: str, scenario: str, agent: str, counts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = (("anchors", 4),) if "hpff" in agent else ()
+    piece = Piece(Variant("x", "x", overrides, scenario, steps=3), (agent,), 0, 1)
+    work._settings.cache_clear()
+    before = piece.settings()["code"]
+    changed, read = Path(identity.__file__).parents[2] / file, Path.read_text
+
+    def with_change(path: Path, encoding: str | None = None) -> str:
+        return read(path, encoding) + ("\nCHANGED = 1\n" if path == changed else "")
+
+    monkeypatch.setattr(Path, "read_text", with_change)
+    for cache in (work._settings, identity._read, identity._closure):
+        cache.cache_clear()
+    after = piece.settings()["code"]
+    for cache in (work._settings, identity._read, identity._closure):
+        cache.cache_clear()
+    assert (after != before) == counts
 
 
 def learned(scale: float, nested: bool) -> Localizer:

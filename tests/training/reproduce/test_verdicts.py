@@ -1,18 +1,26 @@
 """What becomes of a claim is decided by the rule alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from training.evaluation.metrics import Difference
 from training.reproduce.verdicts import (
     CONTRADICTED,
+    MET,
+    MISSED,
     NOT,
     REPRODUCED,
     UNKNOWN,
     Claim,
+    Goal,
+    counts,
     decide,
     gain,
     interval,
+    judge,
+    judge_goals,
     least,
     share,
 )
@@ -55,7 +63,8 @@ def test_sizes_below_a_limit() -> None:
 
 
 def test_what_was_not_measured_says_why() -> None:
-    assert decide(BETTER, None, "dfgo was not flown").reason == "dfgo was not flown"
+    found = decide(BETTER, "dfgo was not run")
+    assert (found.verdict, found.ours, found.reason) == (UNKNOWN, None, "dfgo was not run")
     nothing = interval(np.array([np.nan]))
     assert decide(BETTER, nothing).verdict == UNKNOWN
 
@@ -83,3 +92,43 @@ def test_share_is_exact() -> None:
     assert (found.mean, found.low) == (0.0, 0.0)
     assert found.high == pytest.approx(100 * (1 - 0.025**0.25))
     assert share(np.ones(30, bool)).low > 85
+
+
+class Nothing:
+    def get(self, name: str, agent: str = "", kind: object = None) -> object:
+        return {"a": 1.0, "b": 2.0}.get(agent)
+
+
+def goal(limit: float, above: bool, by: str, agent: str = "a") -> Goal:
+    """A figure of 1.0 with an interval from 0.5 to 1.5."""
+    needs = (("somewhere", agent),)
+    return Goal("g", "m", limit, above, needs, lambda x: Difference(x, x - 0.5, x + 0.5), by)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("limit", "above", "by", "verdict"),
+    [
+        (1.2, False, "mean", MET),
+        (0.9, False, "mean", MISSED),
+        (1.0, False, "mean", MET),
+        (0.9, True, "mean", MET),
+        (1.2, False, "interval", MISSED),
+        (1.6, False, "interval", MET),
+        (0.4, True, "interval", MET),
+        (0.6, False, "not worse", MET),
+        (0.4, False, "not worse", MISSED),
+        (0.9, True, "mean and sign", MET),
+    ],
+)
+def test_goals(limit: float, above: bool, by: str, verdict: str) -> None:
+    (found,) = judge_goals([goal(limit, above, by)], Nothing())
+    assert found.verdict == verdict
+
+
+def test_goals_and_claims_that_lack_something_say_what() -> None:
+    (found,) = judge_goals([goal(1.0, True, "mean", "c")], Nothing())
+    assert (found.verdict, found.reason) == (UNKNOWN, "not run: c in somewhere")
+    claim = replace(BETTER, needs=(("here", "a"), ("here", "c"), ("there", "d")))
+    (found,) = judge([claim], Nothing())
+    assert found.reason == "not run: c, d in here and others"
+    assert "Not measured: not run: c, d in here and others." in counts([found], "claims", [UNKNOWN])

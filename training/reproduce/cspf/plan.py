@@ -1,8 +1,15 @@
-"""Who flies where: the paper's two worlds, shares of outliers, teams, particles, hard worlds."""
+"""Who runs where: the paper's two worlds, shares of outliers, teams, particles, hard worlds,
+recordings; and the measures of a team that agrees."""
 
+from collections.abc import Iterator
 from typing import Any
 
-from training.reproduce.study import Variant
+import numpy as np
+
+from training.evaluation.metrics import Flags, Floats, rmse_per_run
+from training.reproduce.results import Runs
+from training.reproduce.settings import Settings
+from training.reproduce.work import Cell, Variant
 
 TITLE = (
     "Arita & Namerikawa, Collaborative Stein Particle Filter for Cooperative Localization in "
@@ -19,12 +26,13 @@ BESIDE = (
 )
 CENTRAL = ("pf_joint:anneal=0.97:particles=500", "pose_graph:every=50:robust=gnc")  # hard worlds
 LITERAL = ("cspf:variant=paper", "cspf:variant=paper_corrected")
-ACROSS = ("cspf", "cspf:variant=neighbourhood")  # eq. 16 in this filter: thirty times as dear
+ACROSS = ("cspf", "cspf:variant=neighbourhood")  # eq. 16 in this filter: thirty times the cost
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 PUBLISHED = 0.2
-EARLY, LATE = 150, 250  # steps after which convergence is looked at
+EARLY, LATE = 150, 250  # steps after which convergence is measured
 TEAMS = (2, 5, 10, 20)
 PARTICLES = (20, 100, 200, 1000)
+CLOUDS = "clouds"  # a cell
 NAMES = {
     "cspf": "CSPF",
     "cspf:consensus=false": "no consensus",
@@ -32,41 +40,54 @@ NAMES = {
     "pf_joint:anneal=0.96": "annealed PF",
     "pose_graph:every=50": "Huber graph",
 }
+FAST = "cspf:anneal=0.85"  # a step lasts a second and measures every pair: it need not wait as long
+TEAM = (
+    *(FAST, f"{FAST}:consensus=false", f"{FAST}:particles=1"),
+    *("pose_graph:every=10", "pose_graph:every=10:robust=gnc"),
+)
+ALONE = (
+    *("stein_vi", "stein_vi:particles=1", "ekf", "ekf:robust=huber", "ekf:robust=gate"),
+    "pf:particles=20",
+)
+SEQUENCES = ("V1_01_easy", "V1_03_difficult", "MH_04_difficult")
+TRIALS = ("09", "14", "16")
+WRONG = (0.0, 0.2, 0.4)  # of MURP's poses
+MISTAKEN = (0.0, 0.1)  # of EuRoC's landmarks
 
 
-def world(dim: int, steps: int | None, **overrides: Any) -> Variant:
+def world(dim: int, steps: int | None = None, **overrides: Any) -> Variant:
     """A world of the paper's kind, with overrides."""
     key = "-".join((f"stein{dim}d", *(f"{k}={v}" for k, v in overrides.items())))
     words = ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in overrides.items())
     return Variant(key, f"{dim}-D, {words}", tuple(overrides.items()), f"stein{dim}d-v0", steps)
 
 
-def published(dim: int, steps: int | None) -> Variant:
-    """The paper's own share of outliers."""
-    return world(dim, steps, outliers=PUBLISHED)
+def paper(settings: Settings) -> Iterator[Cell]:
+    """The paper's share of outliers with all agents, and outliers from none to half."""
+    for dim in DIMS:
+        published = world(dim, settings.steps, outliers=PUBLISHED)
+        yield Cell(published, (*METHODS, *BESIDE, *LITERAL), settings.runs)
+        for share in SHARES:
+            yield Cell(world(dim, settings.steps, outliers=share), METHODS, settings.runs)
 
 
-def shares(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
-    """Outliers from none to half."""
-    return [(world(dim, steps, outliers=s), METHODS) for dim in DIMS for s in SHARES]
+def beyond(settings: Settings) -> Iterator[Cell]:
+    """More and fewer particles, and the paper's own target; larger teams; hard worlds."""
+    agents = (*(f"cspf:particles={m}" for m in PARTICLES), *ACROSS)
+    published = world(2, settings.steps, outliers=PUBLISHED)
+    yield Cell(published, agents, settings.fraction(10), key=CLOUDS)
+    for variant in teams(settings.steps):
+        yield Cell(variant, METHODS, settings.fraction(_divisor(variant)))
+    for variant in hard(settings.steps):
+        yield Cell(variant, (*METHODS, *CENTRAL), settings.fraction(_divisor(variant)))
 
 
-def teams(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def teams(steps: int | None) -> list[Variant]:
     """More UAVs, one match a step for every two pairs of three."""
-    return [(world(2, steps, n_uavs=n, matches_per_step=max(1, n // 3)), METHODS) for n in TEAMS]
+    return [world(2, steps, n_uavs=n, matches_per_step=max(1, n // 3)) for n in TEAMS]
 
 
-def clouds(steps: int | None) -> tuple[Variant, tuple[str, ...]]:
-    """More and fewer particles, and the paper's own target."""
-    return published(2, steps), (*(f"cspf:particles={m}" for m in PARTICLES), *ACROSS)
-
-
-def few(runs: int) -> int:
-    """Runs of what is dear."""
-    return max(1, runs // 10)
-
-
-def hard(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def hard(steps: int | None) -> list[Variant]:
     """Where many modes persist, and particles might pay: most matches wrong, half of them among
     many, a ring of equals, blurred matches, a sparse network."""
     worlds: tuple[dict[str, Any], ...] = (
@@ -78,15 +99,80 @@ def hard(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
         {"outliers": 0.4, "n_uavs": 6, "comm_radius": 5.0, "matches_per_step": 3},
         {"outliers": 0.4, "message_loss": 0.5},
     )
-    return [(world(2, steps, **each), (*METHODS, *CENTRAL)) for each in worlds]
+    return [world(2, steps, **each) for each in worlds]
 
 
-def runs_in(variant: Variant, runs: int) -> int:
+def _divisor(variant: Variant) -> int:
     """Half of the runs in worlds beyond the paper's; a fifth in teams of more than five, a
     twentieth in those of more than ten, where a step costs twenty times as much."""
-    overrides = dict(variant.overrides)
-    uavs = overrides.get("n_uavs", 3)
-    if uavs > 5:
-        return max(1, runs // (20 if uavs > 10 else 5))
-    own = overrides.keys() == {"outliers"} and overrides["outliers"] <= 0.5
-    return runs if own else max(1, runs // 2)
+    uavs = dict(variant.overrides).get("n_uavs", 3)
+    return 20 if uavs > 10 else 5 if uavs > 5 else 2
+
+
+def murp(trial: str, outliers: float, steps: int | None = None) -> Variant:
+    """A recording's later part, with so many poses replaced."""
+    return Variant(
+        f"murp-{trial}-outliers={outliers}",
+        f"MURP {trial}, outliers {outliers:g}",
+        (("sequence", trial), ("outliers", outliers)),
+        "replay-murp-v0",
+        steps,
+        bounded=False,
+    )
+
+
+def euroc(sequence: str, mistaken: float, steps: int | None = None) -> Variant:
+    """A recording with so many landmarks mistaken for others."""
+    return Variant(
+        f"{sequence}-false={mistaken}",
+        f"{sequence}, false matches {mistaken:g}",
+        (("sequence", sequence), ("false_matches", mistaken)),
+        "replay-stein-euroc-v0",
+        steps,
+        bounded=False,
+    )
+
+
+def real(settings: Settings) -> Iterator[Cell]:
+    """Three agents with ranges (MURP), and one with an IMU and landmarks (EuRoC)."""
+    for trial in TRIALS:
+        for share in WRONG:
+            yield Cell(murp(trial, share, settings.steps), TEAM, settings.fraction(10))
+    for name in SEQUENCES:
+        for share in MISTAKEN:
+            yield Cell(euroc(name, share, settings.steps), ALONE, settings.fraction(10))
+
+
+# ------------------------------------------------------------------ measures
+
+
+def converged(one: Runs, steps: int) -> Flags:
+    """[R]: whether, after so many steps (the last, if there are fewer), every holder's pose of
+    every UAV is within 0.3 m and 10°; never in a run with NaN or a numerical error."""
+    close = one.record.series["converged"][:, min(steps, one.steps) - 1, 0] > 0
+    return close & ~one.record.broken
+
+
+def worst(one: Runs, steps: int) -> Floats:
+    """[R]: the largest position error over holders and UAVs after so many steps, m."""
+    error = one.record.series["team_error"][:, min(steps, one.steps) - 1]
+    return np.where(np.isfinite(error), error, np.inf).max(-1)
+
+
+def converged_over_time(one: Runs) -> Floats:
+    """[K]: share of the runs that have converged."""
+    close = one.record.series["converged"][:, :, 0] > 0
+    return (close & ~one.record.broken[:, None]).mean(0)
+
+
+def late_nees(one: Runs) -> float:
+    """Mean over the second half of the runs' steps."""
+    half = one.steps // 2
+    values = one.record.nees[:, half:][one.scored[:, half:]]
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+
+
+def late(one: Runs) -> Floats:
+    """[R]: RMSE over the last third of each run, m."""
+    start = int((1 - 1 / 3) * one.steps)
+    return rmse_per_run(one.error[:, start:], one.scored[:, start:])

@@ -1,120 +1,164 @@
-"""The report: verdicts, tables and figures."""
+"""Tables, and the paper's figure 4 over many runs; convergence against the share of outliers."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from training.evaluation.tables import table
-from training.reproduce import drawing, reporting, verdicts
-from training.reproduce.cspf import figures, plan, real, tables
-from training.reproduce.cspf.claims import verdicts as judge
-from training.reproduce.cspf.measures import Runs
-from training.reproduce.reporting import Text
-from training.reproduce.study import WORLD, Study, Variant
+from training.evaluation.metrics import rmse_per_run
+from training.reproduce.cspf import plan
+from training.reproduce.cspf.plan import converged, converged_over_time, late, late_nees, worst
+from training.reproduce.drawing import panels
+from training.reproduce.results import Results, Runs
+from training.reproduce.settings import Settings
+from training.reproduce.tables import Table, by_agent, shortened
+from training.reproduce.verdicts import share
+from training.reproduce.work import WORLD
 
-FILES = ("convergence.png", "outliers.png", "paper.json")
-
-
-def runs_of(study: Study, variant: Variant, agents: Sequence[str], count: int) -> dict[str, Runs]:
-    """Those that were flown, by agent; none where the worlds are not there."""
-    if not study.can(variant):
-        return {}
-    results = study.results(variant, list(dict.fromkeys((WORLD, *agents))), count)
-    return {a: Runs(results, a) for a in agents if a in results.agents}
+_COLOURS = ("#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#009E73", "#56B4E9", "#332288", "#999999")
+_Places = Mapping[str, Mapping[str, Runs]]
 
 
-def paper_part(study: Study, runs: int, steps: int | None, folder: Path) -> Text:
-    """Write the figures and ``paper.json``; the part's lines for the report."""
-    own = {}
-    for dim in plan.DIMS:
-        variant = plan.published(dim, steps)
-        agents = (*plan.METHODS, *plan.BESIDE, *plan.LITERAL)
-        own[dim] = runs_of(study, variant, agents, runs)
-    swept = {
-        (dim, share): runs_of(study, plan.world(dim, steps, outliers=share), plan.METHODS, runs)
-        for dim in plan.DIMS
-        for share in plan.SHARES
-    }
-    known = {
-        (plan.published(dim, steps).key, a): r
-        for dim, there in own.items()
-        for a, r in there.items()
-    }
-    known |= {
-        (plan.world(dim, steps, outliers=share).key, a): r
-        for (dim, share), there in swept.items()
-        for a, r in there.items()
-    }
-    judged = judge(known, steps)
-    text = ["## The paper's claims, and the goals", "", verdicts.RULE, "", reporting.counts(judged)]
-    text += ["", *reporting.claims(judged), ""]
-    text += [
-        f"Three UAVs, {runs} runs. *Converged*: every holder's pose of every UAV, relative to "
-        "UAV 0, is within 0.3 m and 10°. *Worst error*: the largest over holders and UAVs, after "
-        f"{plan.EARLY} steps. Pose graphs are solved at every 50th step; their time is that of a "
-        "step without a solution.",
-        "",
+def text(settings: Settings) -> list[str]:
+    """What is to be known of the tables."""
+    return [
+        f"Three UAVs, {settings.runs} runs. *Converged*: every holder's pose of every UAV, "
+        "relative to UAV 0, is within 0.3 m and 10°. *Worst error*: the largest over holders and "
+        f"UAVs, after {plan.EARLY} steps. Pose graphs are solved at every 50th step; their time is "
+        "that of a step without a solution."
     ]
-    titled = {plan.published(dim, steps).title: there for dim, there in own.items() if there}
-    text += titled_table("A fifth of outliers", tables.figures(titled))
-    spread = {
-        plan.world(dim, steps, outliers=share).title: there
-        for (dim, share), there in swept.items()
-        if there
+
+
+def paper_tables(results: Results) -> Iterator[Table]:
+    """The paper's share of outliers, and the others."""
+    published = [plan.world(dim, outliers=plan.PUBLISHED).key for dim in plan.DIMS]
+    agents = (*plan.METHODS, *plan.BESIDE, *plan.LITERAL)
+    yield _table("A fifth of outliers", _places(results, published, agents))
+    keys = [plan.world(dim, outliers=x).key for dim in plan.DIMS for x in plan.SHARES]
+    yield _table("None to half", _places(results, keys, plan.METHODS))
+
+
+def beyond_tables(results: Results) -> Iterator[Table]:
+    """Particles, teams, hard worlds."""
+    agents = (*(f"cspf:particles={m}" for m in plan.PARTICLES), *plan.ACROSS)
+    yield _table("Particles, and eq. 16", _places(results, [plan.CLOUDS], agents))
+    teams, hard = ([v.key for v in some] for some in (plan.teams(None), plan.hard(None)))
+    yield _table("Larger teams", _places(results, teams, plan.METHODS))
+    methods = (*plan.METHODS, *plan.CENTRAL)
+    yield _table("Where many modes persist", _places(results, hard, methods))
+
+
+def real_tables(results: Results) -> Iterator[Table]:
+    """Errors on recordings."""
+    keys = [plan.murp(trial, x).key for trial in plan.TRIALS for x in plan.WRONG]
+    team = _places(results, keys, (WORLD, *plan.TEAM))
+    keys = [plan.euroc(name, x).key for name in plan.SEQUENCES for x in plan.MISTAKEN]
+    columns = [
+        ("runs", lambda one: str(len(one.error))),
+        ("RMSE (m)", shortened(lambda x: np.mean(rmse_per_run(x.error, x.scored)))),
+        ("last third (m)", shortened(lambda x: np.mean(late(x)))),
+        ("worst run's (m)", shortened(lambda x: np.max(late(x)))),
+        ("converged at the end (%)", _converged_at_end),
+        ("NEES", shortened(late_nees)),
+        ("ms a step", _cost),
+    ]
+    places = team | _places(results, keys, (WORLD, *plan.ALONE))
+    yield by_agent("Errors", places, columns, where="recording")
+
+
+def _places(
+    results: Results, keys: list[str], agents: tuple[str, ...]
+) -> dict[str, dict[str, Runs]]:
+    found = {key: results.runs(key, agents) for key in keys}
+    return {results.variant(key).title: there for key, there in found.items() if there}
+
+
+def _table(title: str, places: _Places) -> Table:
+    """Share converged, worst error, NEES, time of a step."""
+    columns = [
+        ("runs", lambda one: str(len(one.error))),
+        (f"converged at {plan.EARLY} (%)", lambda one: _share(one, plan.EARLY)),
+        (f"at {plan.LATE} (%)", lambda one: _share(one, plan.LATE)),
+        ("worst error, median (m)", shortened(lambda x: np.median(worst(x, plan.EARLY)))),
+        (
+            "90 % of runs (m)",
+            shortened(lambda x: np.quantile(worst(x, plan.EARLY), 0.9, method="higher")),
+        ),
+        ("NEES", shortened(late_nees)),
+        ("ms a step", _cost),
+    ]
+    return by_agent(title, places, columns, where="world")
+
+
+def _share(one: Runs, steps: int) -> str:
+    """Per cent of the runs with the exact interval; nothing where runs were cut before."""
+    if one.steps < steps:
+        return ""
+    found = share(converged(one, steps))
+    return f"{found.mean:.0f} ({found.low:.0f} to {found.high:.0f})"
+
+
+def _converged_at_end(one: Runs) -> str:
+    known = "converged" in one.record.series
+    return f"{100 * converged(one, one.steps).mean():.0f}" if known else ""
+
+
+def _cost(one: Runs) -> str:
+    cost = one.record.ms_per_step
+    return "" if cost is None else f"{cost:.2f}"
+
+
+# ------------------------------------------------------------------ figures
+
+
+def over_time(results: Results) -> Figure | None:
+    """Share of the runs in which every holder's pose of every UAV is within 0.3 m and 10°, over
+    steps, at the paper's share of outliers (its figure 4 shows one run)."""
+    keys = [plan.world(dim, outliers=plan.PUBLISHED).key for dim in plan.DIMS]
+    places = _places(results, keys, plan.METHODS)
+    if not places:
+        return None
+    size = (4.8 * len(places), 3.4)
+    figure, (row,) = panels(1, len(places), size, "Convergence, a fifth of all matches wrong")
+    for axes, (title, there) in zip(row, places.items(), strict=True):
+        for i, (agent, one) in enumerate(there.items()):
+            axes.plot(100 * converged_over_time(one), linewidth=1.4, **_style(agent, i))
+        axes.set(xlabel="step", ylabel="runs converged (%)", ylim=(-3, 103), title=title)
+    row[0].legend(fontsize=7, loc="center right")
+    return figure
+
+
+def over_shares(results: Results) -> Figure | None:
+    """Above: share of the runs converged after 150 steps, with exact 95 % intervals; below: median
+    of the worst error over holders and UAVs; against the share of wrong matches."""
+    found = {
+        dim: {x: results.runs(plan.world(dim, outliers=x).key, plan.METHODS) for x in plan.SHARES}
+        for dim in plan.DIMS
     }
-    text += titled_table("None to half", tables.figures(spread))
-    drawings: dict[str, Callable[[], Figure]] = {}
-    if titled:
-        lines = {
-            title: {a: r for a, r in there.items() if a in plan.METHODS}
-            for title, there in titled.items()
-        }
-        drawings[FILES[0]] = partial(figures.over_time, lines)
-    if any(swept.values()):
-        drawings[FILES[1]] = partial(figures.over_shares, {k: v for k, v in swept.items() if v})
-    text += _draw(drawings, folder)
-    content = {"runs": runs, "claims": [reporting.as_json(each) for each in judged]}
-    reporting.write_json(folder / FILES[-1], content)
-    return text
+    dims = [dim for dim, there in found.items() if any(there.values())]
+    if not dims:
+        return None
+    figure, rows = panels(2, len(dims), (4.8 * len(dims), 6.0), "How many wrong matches it takes")
+    for upper, lower, dim in zip(*rows, dims, strict=True):
+        for i, agent in enumerate(plan.METHODS):
+            have = {x: there[agent] for x, there in found[dim].items() if agent in there}
+            if not have:
+                continue
+            hits = [share(converged(one, plan.EARLY)) for one in have.values()]
+            reach = np.array([(h.mean - h.low, h.high - h.mean) for h in hits]).T
+            errors = [float(np.median(worst(one, plan.EARLY))) for one in have.values()]
+            at, style = np.array(list(have)) + 0.003 * (i - 2), _style(agent, i)
+            upper.errorbar(at, [h.mean for h in hits], reach, marker="o", markersize=3, **style)
+            lower.plot(at, errors, marker="o", markersize=3, **style)
+        upper.set(ylabel="runs converged (%)", ylim=(-3, 103), title=f"{dim}-D")
+        lower.set(ylabel="worst error (m)", xlabel="share of outliers", yscale="log")
+    rows[0][0].legend(fontsize=7, loc="lower left")
+    return figure
 
 
-def beyond_part(study: Study, runs: int, steps: int | None) -> Text:
-    """The study beyond the paper; its lines for the report."""
-    text = ["## Beyond the paper", ""]
-    variant, agents = plan.clouds(steps)
-    there = runs_of(study, variant, agents, plan.few(runs))
-    if there:
-        text += titled_table("Particles, and eq. 16", tables.figures({variant.title: there}))
-    for title, planned in (
-        ("Larger teams", plan.teams(steps)),
-        ("Where many modes persist", plan.hard(steps)),
-    ):
-        found = {v.title: runs_of(study, v, a, plan.runs_in(v, runs)) for v, a in planned}
-        text += titled_table(title, tables.figures({k: t for k, t in found.items() if t}))
-    return text
+def _style(agent: str, index: int) -> dict[str, Any]:
+    return {"label": plan.NAMES.get(agent, agent), "color": _COLOURS[index % len(_COLOURS)]}
 
 
-def real_part(study: Study, runs: int, steps: int | None) -> Text:
-    """Recordings; the part's lines for the report."""
-    count = plan.few(runs)
-    found = {v: runs_of(study, v, (WORLD, *a), count) for v, a in real.planned(steps)}
-    judged = real.verdicts({v.key: there for v, there in found.items()}, steps)
-    text = ["## Recordings", "", reporting.counts(judged), "", *reporting.claims(judged), ""]
-    return text + titled_table("Errors", real.table({v.title: t for v, t in found.items() if t}))
-
-
-def titled_table(title: str, content: tables.Table) -> Text:
-    """A table under its title; nothing where there are no lines."""
-    header, lines = content
-    return [f"### {title}", "", *table(header, lines, left=2), ""] if lines else []
-
-
-def _draw(drawings: Mapping[str, Callable[[], Figure]], folder: Path) -> Text:
-    text: Text = []
-    for name, drawn in drawings.items():
-        drawing.save(drawn, folder / name)
-        words = drawing.caption(getattr(drawn, "func", drawn))
-        text += [f"![{words}]({name})", "", f"*{words}*", ""]
-    return text
+FIGURES = {"convergence.png": over_time, "outliers.png": over_shares}

@@ -65,7 +65,7 @@ class Calibration:
     """Mean probability, share that failed, and number of samples in bins of the probability (NaN
     where a bin is empty); Brier score and expected calibration error."""
 
-    said: NDArray[np.float64]
+    probability: NDArray[np.float64]
     failed: NDArray[np.float64]
     count: NDArray[np.int64]
     brier: float
@@ -102,11 +102,11 @@ def calibration(probability: Floats, failed: Flags) -> Calibration:
     which = np.minimum((probability * BINS).astype(np.int64), BINS - 1)
     count = np.bincount(which, minlength=BINS)
     with np.errstate(invalid="ignore"):
-        said = np.bincount(which, probability, BINS) / count
+        mean = np.bincount(which, probability, BINS) / count
         share = np.bincount(which, failed.astype(np.float64), BINS) / count
-    gap = np.where(count > 0, np.abs(said - share), 0.0)
+    gap = np.where(count > 0, np.abs(mean - share), 0.0)
     brier = float(np.mean((probability - failed) ** 2))
-    return Calibration(said, share, count, brier, float((gap * count).sum() / count.sum()))
+    return Calibration(mean, share, count, brier, float((gap * count).sum() / count.sum()))
 
 
 def _share(part: int, rest: int) -> float:

@@ -1,10 +1,19 @@
-"""Who flies where: the paper's cases, the detector's scenarios, and the study beyond."""
+"""Who runs where: the paper's cases, the detector's scenarios, and the study beyond; and the
+measures of restarted filters."""
 
+from collections.abc import Iterable, Iterator
 from itertools import product
 
+import numpy as np
+
 from coloc_env.scenarios import parse_override
-from training.learning.nnhpff import MAINS, VARIANTS
-from training.reproduce.study import Variant
+from training.evaluation import metrics
+from training.evaluation.metrics import Flags, Floats
+from training.learning.nnhpff import FAILED, MAINS, VARIANTS
+from training.reproduce.cost import COST
+from training.reproduce.results import Runs
+from training.reproduce.settings import Settings
+from training.reproduce.work import Cell, Training, Variant
 
 TITLE = "Neural-network-aided hybrid particle/FIR filter, *Electronics* 2025, 14(21), 4346"
 METHODS = ("pf", "hpff", "nnhpff")
@@ -20,9 +29,56 @@ _INDOOR = (("anchors", 4), ("horizon", 600))
 INDOOR_METHODS = ("pfnn", "hpff:main=pfnn", "nnhpff:main=pfnn")
 INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:main=ekf")
 PATIENT = "patience=4"  # steps: longer than an outlier stays in the FIR filter's window
+FIRST_CORNER = 100  # step
+SETTLED = 20  # step from which a filter's start is over
+HELD = 10  # steps that an error must stay small to count as recovered
+WITHIN = 100  # steps in which a recovery counts
+LEARNING = Training(  # figure 4's: the paper's 27 scenarios once an epoch
+    "nnhpff", "nnhpff", (("worlds", 1), ("epochs", 10), ("score_runs", 0))
+)
+Planned = tuple[Variant, tuple[str, ...]]
 
 
-def case(number: int, steps: int | None, **overrides: float) -> Variant:
+def paper(settings: Settings) -> Iterator[Cell]:
+    """The three cases, and what a step costs."""
+    for number in CASES:
+        yield Cell(case(number, settings.steps), (*METHODS, *BESIDE), settings.runs)
+    yield Cell(case(1, settings.steps), (*METHODS, "ekf"), 1, COST)
+
+
+def detector(settings: Settings) -> Iterator[Cell]:
+    """The detector watching, never restarting anything: worlds of its training's scenarios, and of
+    others."""
+    for variant, agents in (*trained_on(settings.steps), *never_seen(settings.steps)):
+        yield Cell(variant, agents, settings.fraction(10))
+
+
+def beyond(settings: Settings) -> Iterator[Cell]:
+    """Sensitivity, kidnapping, NLOS, recordings."""
+    steps = settings.steps
+    planned: Iterable[Planned] = (
+        *(*sensitivity(steps), *kidnapping(steps)),
+        *(*blocked(steps), *recordings(steps)),
+    )
+    for variant, agents in planned:
+        yield Cell(variant, agents, settings.fraction(_divisor(variant)))
+
+
+def _divisor(variant: Variant) -> int:
+    """Half the runs in the study beyond; a tenth indoors, with six UAVs; a twentieth of recordings,
+    whose runs differ in their start alone."""
+    if variant.key in {case(number).key for number in CASES}:
+        return 1
+    return {"indoor-v0": 10, "wsn-v0": 2}.get(variant.scenario, 20)
+
+
+def trainings(settings: Settings) -> Iterator[Training]:
+    """Figure 4's, with the whole study only."""
+    if settings.variants is None and settings.steps is None:
+        yield LEARNING
+
+
+def case(number: int, steps: int | None = None, **overrides: float) -> Variant:
     """A case of the paper, with overrides."""
     key = "-".join((f"case{number}", *(f"{k}={v:g}" for k, v in overrides.items())))
     words = "".join(f", {k} = {v:g}" for k, v in overrides.items())
@@ -31,15 +87,15 @@ def case(number: int, steps: int | None, **overrides: float) -> Variant:
     )
 
 
-def trained_on(steps: int | None) -> list[tuple[Variant, str]]:
+def trained_on(steps: int | None = None) -> list[Planned]:
     """The detector's training scenarios, each with its main filter; in worlds of other seeds."""
     return [
-        (_variant("trained", text, steps), _open_loop(main))
+        (_variant("trained", text, steps), (_open_loop(main),))
         for text, main in product(VARIANTS.split("/"), MAINS.split("/"))
     ]
 
 
-def never_seen(steps: int | None) -> list[tuple[Variant, str]]:
+def never_seen(steps: int | None = None) -> list[Planned]:
     """Scenarios that differ from all of those: in what is believed, in the true noise, in what goes
     wrong."""
     texts = (
@@ -53,13 +109,14 @@ def never_seen(steps: int | None) -> list[tuple[Variant, str]]:
     )
     mains = ("pf:particles=1000", "pf:particles=5000")
     return [
-        (_variant("unseen", text, steps), _open_loop(main)) for text, main in product(texts, mains)
+        (_variant("unseen", text, steps), (_open_loop(main),))
+        for text, main in product(texts, mains)
     ]
 
 
-def sensitivity(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def sensitivity(steps: int | None = None) -> list[Planned]:
     """How the verdicts move with σ, M, Q and the χ² quantile."""
-    found: list[tuple[Variant, tuple[str, ...]]] = []
+    found: list[Planned] = []
     for number in CASES:
         own = (f"hpff:quantile={q:g}" for q in QUANTILES)
         longer = (f"{a}:auxiliary=emvf@memory={m}" for a in METHODS[1:] for m in MEMORIES)
@@ -75,7 +132,7 @@ def sensitivity(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
     return found
 
 
-def kidnapping(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def kidnapping(steps: int | None = None) -> list[Planned]:
     """The robot, and half a team, are put somewhere else."""
     half = (("kidnap_at", INDOOR_KIDNAPPED_AT), ("kidnapped", (0, 1, 2)), *_INDOOR)
     beside = ("ekf", "pf:tempering=true", "nnhpff:main=ekf")
@@ -98,7 +155,7 @@ def kidnapping(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
     ]
 
 
-def blocked(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def blocked(steps: int | None = None) -> list[Planned]:
     """An anchor all of whose ranges are NLOS, 1 m too long on average."""
     indoors = (("nlos_anchor", 1), *_INDOOR)
     return [
@@ -111,12 +168,12 @@ def blocked(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
     ]
 
 
-def recordings(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
+def recordings(steps: int | None = None) -> list[Planned]:
     """Real ranges to fixed anchors, believed to come from constant velocity."""
 
     def replay(
         key: str, title: str, name: str, memory: int, *overrides: tuple[str, str]
-    ) -> tuple[Variant, tuple[str, ...]]:
+    ) -> Planned:
         emvf = f"emvf:memory={memory}"
         patient = tuple(
             f"{agent}:{PATIENT}:auxiliary={emvf.replace(':', '@')}" for agent in METHODS[1:]
@@ -148,20 +205,6 @@ def recordings(steps: int | None) -> list[tuple[Variant, tuple[str, ...]]]:
     ]
 
 
-def runs_in(variant: Variant, runs: int) -> int:
-    """Half the runs in the study beyond; a tenth indoors, where six UAVs fly; a twentieth of
-    recordings, whose runs differ in their start alone."""
-    if variant.key in {case(number, None).key for number in CASES}:
-        return runs
-    shares = {"indoor-v0": 10, "wsn-v0": 2}
-    return max(1, runs // shares.get(variant.scenario, 20))
-
-
-def scenario_runs(runs: int) -> int:
-    """Runs of each of the detector's scenarios."""
-    return max(1, runs // 10)
-
-
 def kidnapped_step(variant: Variant) -> int:
     """The step at which a variant's UAVs are carried."""
     return round(float(dict(variant.overrides)["kidnap_at"]) / variant.build().arena.dt)
@@ -183,3 +226,45 @@ def _variant(kind: str, text: str, steps: int | None) -> Variant:
     return Variant(
         f"{kind}-{text.replace(':', '-')}", text.replace(":", ", "), overrides, "wsn-v0", steps
     )
+
+
+# ------------------------------------------------------------------ measures
+
+
+def resets(one: Runs) -> Floats:
+    """[R, K, N]: 1 where the main filter was restarted."""
+    series = one.record.series.get("resets_per_run")
+    return np.zeros_like(one.error) if series is None else series
+
+
+def settled_error(one: Runs) -> Floats:
+    """[R]: mean error after the first 2 s, m."""
+    return metrics.mean_per_run(one.error[:, SETTLED:], one.scored[:, SETTLED:])
+
+
+def resets_per_run(one: Runs) -> Floats:
+    """[R], mean over UAVs."""
+    return resets(one).sum(1).mean(-1)
+
+
+def corner_peak(one: Runs) -> Floats:
+    """[R]: largest error on the side after the first corner, m; NaN for runs cut before it."""
+    side = one.error[:, FIRST_CORNER : 2 * FIRST_CORNER]
+    return side.max(1).mean(-1) if side.size else np.full(len(side), np.nan)
+
+
+def first_reset(one: Runs, after: int = FIRST_CORNER) -> Floats:
+    """[R]: step of the first reset from step ``after`` on; infinity if there is none."""
+    late = resets(one)[:, after:, 0] > 0
+    if not late.size:
+        return np.full(len(late), np.inf)
+    return np.where(late.any(1), after + late.argmax(1), np.inf)
+
+
+def recovery(one: Runs, step: int, uavs: slice) -> Floats:
+    """[R, n]: seconds from ``step`` until the errors of some UAVs stay small for a second;
+    infinity if that takes more than 10 s."""
+    late = one.error[:, step : step + WITHIN + HELD, uavs] < FAILED
+    windows = np.lib.stride_tricks.sliding_window_view(late, HELD, 1)
+    held: Flags = np.asarray(windows.all(axis=-1))
+    return one.dt * np.where(held.any(1), held.argmax(1).astype(float), np.inf)

@@ -1,2 +1,26 @@
-"""PF-NN: Wang, Wang, Liu, *Computers* 2026, 15(3), 172: adaptive particle filter with a neural
-weight corrector. Its tables 3–5 and figures 2–9, and a study of robustness beyond it."""
+"""PF-NN: its tables 3 to 5 and figures 2 to 9, and a study of robustness beyond it."""
+
+from training.reproduce.pfnn import claims, figures, paper, plan, robustness, tables
+from training.reproduce.study import Part, Study
+
+
+def pfnn() -> Study:
+    """PF-NN: an adaptive particle filter with a neural weight corrector, and robust filters in
+    worlds beyond it (*Computers* 2026, 15(3), 172)."""
+    own = Part(
+        "Tables and figures of the paper",
+        plan.paper,
+        tables.text,
+        claims.claims,
+        tables=tables.tables,
+        figures=figures.FIGURES,
+    )
+    beyond = Part(
+        "Robustness",
+        plan.robustness,
+        goals=robustness.goals,
+        tables=robustness.tables,
+        figures=robustness.FIGURES,
+    )
+    parts = {"paper": own, "robustness": beyond}
+    return Study("pfnn", "PF-NN", paper.TITLE, paper.RUNS, parts)

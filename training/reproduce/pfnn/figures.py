@@ -1,8 +1,6 @@
 """The paper's figures 2 to 9, redrawn from our runs."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,24 +16,16 @@ from training.evaluation import metrics
 from training.evaluation.figures import BOUND, log_axis
 from training.evaluation.metrics import Floats
 from training.reproduce import drawing
+from training.reproduce.measures import largest, rmse
 from training.reproduce.pfnn import paper
-from training.reproduce.pfnn.flown import Flown
-from training.reproduce.pfnn.plan import ablation_agents
+from training.reproduce.pfnn.plan import ABLATION, DEFAULT, FIGURE_9, particles
+from training.reproduce.results import Results, Runs
+from training.reproduce.verdicts import interval
 
-FILES = (
-    "figure_2_ablation.png",
-    "figure_3_trajectories.png",
-    "figure_4_errors.png",
-    "figure_5_rmse.png",
-    "figure_6_boxes.png",
-    "figure_7_particles.png",
-    "figure_8_ess.png",
-    "figure_9_cdf.png",
-)
 SHOWN = "pfnn"  # whose figures 3 to 8 are
 _ACROSS = 3  # panels beside each other
 _ACCENT, _CALM = rgb("#D55E00"), rgb("#8d9ab0")
-_LINES = {  # figure 9b: as the paper's lines, in colours that all eyes tell apart
+_LINES = {  # figure 9b: as the paper's lines, in colours that all eyes distinguish
     "pfnn": {"color": "#009E73", "linestyle": "-", "linewidth": 2.4},
     "pf500": {"color": "#D55E00", "linestyle": "--", "linewidth": 1.6},
     "pf800": {"color": "#E69F00", "linestyle": "-.", "linewidth": 1.6},
@@ -44,51 +34,25 @@ _LINES = {  # figure 9b: as the paper's lines, in colours that all eyes tell apa
 }
 
 
-def draw(flown: Flown, folder: Path) -> dict[str, str]:
-    """Write the figures that there are runs for; their captions by file name."""
-    drawings: Sequence[Callable[[Flown], Figure]] = (
-        ablation,
-        trajectories,
-        errors,
-        bars,
-        boxes,
-        particles,
-        ess,
-        cdf,
-    )
-    captions = {}
-    for name, drawn in zip(FILES, drawings, strict=True):
-        if drawn is ablation:
-            needs = set(ablation_agents())
-        else:
-            needs = set(_LINES) if drawn is cdf else {SHOWN}
-        if not needs & flown.tables.agents.keys():
-            continue
-        drawing.save(partial(drawn, flown), folder / name)
-        captions[name] = drawing.caption(drawn)
-    return captions
-
-
-def ablation(flown: Flown) -> Figure:
+def ablation(results: Results) -> Figure | None:
     """Figure 2: ablation of the correction's range; dots: mean over runs, bars: 95 % interval."""
-    spans = {a: s for a, s in ablation_agents().items() if a in flown.tables.agents}
-    figure, panels = _panels(
-        3, 3.6, f"Ablation of the correction's range · {flown.tables.runs} runs", sharey=True
-    )
+    there = results.runs(DEFAULT, list(ABLATION))
+    if not there:
+        return None
+    count = len(next(iter(there.values())).error)
+    title = f"Ablation of the correction's range · {count} runs"
+    figure, panels = _panels(3, 3.6, title, sharey=True)
     row = paper.TABLE_4["pfnn"]
     assert row.particles is not None
-    columns: tuple[tuple[str, Callable[[str], Floats | None], float], ...] = (
-        ("RMSE (m)", flown.rmse, row.rmse.mean),
-        ("largest error (m)", flown.largest, row.max.mean),
-        ("average particles", flown.particles, row.particles.mean),
+    columns: tuple[tuple[str, Callable[[Runs], Floats], float], ...] = (
+        ("RMSE (m)", rmse, row.rmse.mean),
+        ("largest error (m)", largest, row.max.mean),
+        ("average particles", particles, row.particles.mean),
     )
-    for axes, (label, of, theirs) in zip(panels, columns, strict=True):
-        for i, agent in enumerate(spans):
-            values = of(agent)
-            if values is None:
-                continue
-            found = metrics.paired_difference(values, np.zeros_like(values))
-            colour = _ACCENT if spans[agent] == paper.PROPOSED else MUTED
+    for axes, (label, measure, theirs) in zip(panels, columns, strict=True):
+        for i, (agent, one) in enumerate(there.items()):
+            found = interval(measure(one))
+            colour = _ACCENT if ABLATION[agent] == paper.PROPOSED else MUTED
             if np.isfinite(found.low):
                 axes.plot([found.low, found.high], [i, i], color=colour, linewidth=2.5)
             axes.plot(found.mean, i, "o", color=colour)
@@ -96,27 +60,31 @@ def ablation(flown: Flown) -> Figure:
         axes.set_title(f"paper, [0.4, 1.0]: {theirs:g}", fontsize=9, fontweight="normal")
         axes.margins(x=0.15)
         axes.locator_params(axis="x", nbins=4)
-    panels[0].set_yticks(range(len(spans)), [f"[{a}, {b}]" for a, b in spans.values()])
+    spans = [ABLATION[agent] for agent in there]
+    panels[0].set_yticks(range(len(spans)), [f"[{a}, {b}]" for a, b in spans])
     panels[0].set_ylim(len(spans) - 0.5, -0.5)
     return figure
 
 
-def trajectories(flown: Flown) -> Figure:
+def trajectories(results: Results) -> Figure | None:
     """Figure 3: trajectories of the first run; coloured: true, dashed: estimated, squares:
     landmarks."""
-    results = flown.tables
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    world, truth = one.evaluation, one.truth[0]
     figure = Figure(figsize=(9.5, 5.6))
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot(projection="3d")
-    estimate = results.worlds.truth[0] + results.agents[SHOWN].offset[0]
-    for i, colour in enumerate(_uavs(flown)):
-        axes.plot(*results.worlds.truth[0, :, i].T, color=colour, linewidth=1.0, label=_name(i))
+    estimate = truth + one.record.offset[0]
+    for i, colour in enumerate(_uavs(one)):
+        axes.plot(*truth[:, i].T, color=colour, linewidth=1.0, label=_name(i))
         axes.plot(*estimate[:, i].T, "--", color=INK, linewidth=0.8)
-    leaves = World(results.scenario, window=1).reset(results.seed).leaves
+    leaves = World(world.scenario, window=1).reset(world.seed).leaves
     if "landmark_map" in leaves:
         places = leaves["landmark_map"][0, 0].unflatten(-1, (-1, 3))
         axes.plot(*places.T.numpy(), "s", color="black", markersize=4, label="landmark")
-    low, high = results.scenario.arena.low, results.scenario.arena.high
+    low, high = world.scenario.arena.low, world.scenario.arena.high
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
     axes.locator_params(axis="y", nbins=4)
@@ -126,35 +94,40 @@ def trajectories(flown: Flown) -> Figure:
     dashed = Line2D([], [], color=INK, linestyle="--", linewidth=0.8, label="estimate")
     figure.legend(handles=[*lines, dashed], loc="center right")
     figure.subplots_adjust(left=0.0, right=0.82, bottom=0.0, top=0.98)
-    drawing.headline(figure, f"Trajectories · PF-NN, seed {results.seed}")
+    drawing.headline(figure, f"Trajectories · PF-NN, seed {world.seed}")
     return figure
 
 
-def errors(flown: Flown) -> Figure:
+def errors(results: Results) -> Figure | None:
     """Figure 4: position error over time; bold: root mean square over runs, thin: run 1, dashed:
     bound."""
-    results = flown.tables
-    error = results.agents[SHOWN].error
-    squares = np.sqrt(np.nanmean(np.where(results.worlds.scored, error, np.nan) ** 2, 0))
-    figure, panels = _over_time(flown, "Position error over time", "error (m)", error[0], squares)
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    error, bound = one.error, one.evaluation.bound
+    squares = np.sqrt(np.nanmean(np.where(one.scored, error, np.nan) ** 2, 0))
+    figure, panels = _over_time(one, "Position error over time", "error (m)", error[0], squares)
     for i, axes in enumerate(panels):
-        if results.bound is not None:
-            axes.plot(_time(flown), results.bound.position[:, i].numpy(), **BOUND)
+        if bound is not None:
+            axes.plot(_time(one), bound.position[:, i].numpy(), **BOUND)
         log_axis(axes.yaxis, axes.set_yscale)
     return figure
 
 
-def bars(flown: Flown) -> Figure:
+def bars(results: Results) -> Figure | None:
     """Figure 5: RMSE of each UAV, the paper's above ours (mean over runs; whiskers: standard
     deviation)."""
-    figure, (axes,) = _panels(1, 3.8, f"RMSE of each UAV · PF-NN, {flown.tables.runs} runs")
-    tracks = metrics.rmse_per_track(flown.error(SHOWN), flown.tables.worlds.scored)
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    figure, (axes,) = _panels(1, 3.8, f"RMSE of each UAV · PF-NN, {len(one.error)} runs")
+    tracks = metrics.rmse_per_track(one.error, one.scored)
     ours, apart = tracks.mean(0), tracks.std(0)
     theirs = [row.rmse for name, row in paper.TABLE_3.items() if name != "Average"]
     at = np.arange(len(ours))
     few = min(len(theirs), len(ours))
     axes.barh(at[:few] - 0.2, theirs[:few], 0.38, color=_CALM)
-    axes.barh(at + 0.2, ours, 0.38, color=_uavs(flown), xerr=apart, error_kw={"ecolor": INK})
+    axes.barh(at + 0.2, ours, 0.38, color=_uavs(one), xerr=apart, error_kw={"ecolor": INK})
     for y, value in zip(at[:few] - 0.2, theirs, strict=False):
         axes.text(value, y, f" paper {value:.3f}", va="center", fontsize=8, color=MUTED)
     for y, value, spread in zip(at + 0.2, ours, apart, strict=True):
@@ -166,14 +139,16 @@ def bars(flown: Flown) -> Figure:
     return figure
 
 
-def boxes(flown: Flown) -> Figure:
+def boxes(results: Results) -> Figure | None:
     """Figure 6: position errors of each UAV, all steps and runs; box: quartiles, whiskers: 5 % to
     95 %, cross: the largest."""
-    figure, (axes,) = _panels(1, 3.8, f"Position errors · PF-NN, {flown.tables.runs} runs")
-    results = flown.tables
-    error = results.agents[SHOWN].error
-    for i, colour in enumerate(_uavs(flown)):
-        values, line = error[:, :, i][results.worlds.scored[:, :, i]], {"color": colour}
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    error = one.error
+    figure, (axes,) = _panels(1, 3.8, f"Position errors · PF-NN, {len(error)} runs")
+    for i, colour in enumerate(_uavs(one)):
+        values, line = error[:, :, i][one.scored[:, :, i]], {"color": colour}
         axes.boxplot(
             [values],
             positions=[i],
@@ -197,50 +172,57 @@ def boxes(flown: Flown) -> Figure:
     return figure
 
 
-def particles(flown: Flown) -> Figure:
+def counts(results: Results) -> Figure | None:
     """Figure 7: particles over time; bold: mean over runs, thin: run 1, dotted: the 800 at which
     the paper's saturate."""
-    count = flown.tables.agents[SHOWN].series["particles"]
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    count = one.record.series["particles"]
     mean = np.nanmean(count, 0)
-    figure, panels = _over_time(flown, "Particles over time", "particles", count[0], mean)
+    figure, panels = _over_time(one, "Particles over time", "particles", count[0], mean)
     for axes in panels:
         axes.axhline(paper.MAX_PARTICLES, color=MUTED, linestyle=":", linewidth=1.3)
         axes.set_ylim(0, 1.1 * paper.MAX_PARTICLES)
     return figure
 
 
-def ess(flown: Flown) -> Figure:
+def ess(results: Results) -> Figure | None:
     """Figure 8: effective share of the particles before resampling; bold: mean over runs and 5 s,
     thin: run 1, shade: the paper's 0.3 to 0.6."""
-    share = flown.tables.agents[SHOWN].series["ess_share"]
-    width = max(1, min(round(5.0 / flown.tables.dt), share.shape[1]))
+    one = results.get(DEFAULT, SHOWN)
+    if one is None:
+        return None
+    share = one.record.series["ess_share"]
+    width = max(1, min(round(5.0 / one.dt), share.shape[1]))
     smooth = uniform_filter1d(np.nanmean(share, 0), width, axis=0, mode="nearest")
     title = "Effective sample size over time"
-    figure, panels = _over_time(flown, title, "ESS ÷ particles", share[0], smooth)
+    figure, panels = _over_time(one, title, "ESS ÷ particles", share[0], smooth)
     for axes in panels:
         axes.axhspan(*paper.ESS_BAND, color=MUTED, alpha=0.15, linewidth=0, zorder=0)
         axes.set_ylim(0, 1)
     return figure
 
 
-def cdf(flown: Flown) -> Figure:
+def cdf(results: Results) -> Figure | None:
     """Figure 9: distribution of the RMSE over runs; left: each UAV (dashed: its mean), right:
     methods."""
-    results = flown.cdf
-    title = f"Distribution of the RMSE · {results.runs} runs"
+    there = results.runs(FIGURE_9, list(_LINES))
+    if not there:
+        return None
+    whole = next(iter(there.values())).evaluation
+    title = f"Distribution of the RMSE · {whole.runs} runs"
     figure, (left, right) = _panels(2, 4.4, title, sharey=True)
-    if SHOWN in results.agents:
-        tracks = metrics.rmse_per_track(results.agents[SHOWN].error, results.worlds.scored)
-        for i, colour in enumerate(_uavs(flown)):
+    if SHOWN in there:
+        tracks = metrics.rmse_per_track(there[SHOWN].error, there[SHOWN].scored)
+        for i, colour in enumerate(_uavs(there[SHOWN])):
             _steps(left, tracks[:, i], color=colour, linewidth=1.4, label=_name(i))
             left.axvline(tracks[:, i].mean(), color=colour, linestyle="--", linewidth=0.8)
         left.legend(loc="lower right")
-    for agent, look in _LINES.items():
-        if agent in results.agents:
-            values = metrics.rmse_per_run(results.agents[agent].error, results.worlds.scored)
-            _steps(right, values, label=paper.METHODS[agent], **look)
-    if results.bound is not None:
-        right.axvline(results.bound.rmse, label="posterior bound", **BOUND)
+    for agent, one in there.items():
+        _steps(right, rmse(one), label=paper.METHODS[agent], **_LINES[agent])
+    if whole.bound is not None:
+        right.axvline(whole.bound.rmse, label="posterior bound", **BOUND)
     right.legend(loc="lower right")
     left.set(ylabel="share of runs below (%)", ylim=(0, 101))
     for axes, part in ((left, "PF-NN, each UAV"), (right, "methods, whole team")):
@@ -262,14 +244,14 @@ def _panels(
 
 
 def _over_time(
-    flown: Flown, title: str, label: str, thin: Floats, bold: Floats
+    one: Runs, title: str, label: str, thin: Floats, bold: Floats
 ) -> tuple[Figure, list[Axes]]:
     """A panel for each UAV with two lines [K, N]."""
-    colours = _uavs(flown)
+    colours = _uavs(one)
     rows = -(-len(colours) // _ACROSS)
-    size, headline = (9.5, 1.0 + 1.9 * rows), f"{title} · PF-NN, {flown.tables.runs} runs"
+    size, headline = (9.5, 1.0 + 1.9 * rows), f"{title} · PF-NN, {len(one.error)} runs"
     figure, grid = drawing.panels(rows, _ACROSS, size, headline, sharex=True, sharey=True)
-    every, time = [axes for row in grid for axes in row], _time(flown)
+    every, time = [axes for row in grid for axes in row], _time(one)
     for axes in every[len(colours) :]:
         axes.set_visible(False)
     for i, (axes, colour) in enumerate(zip(every, colours, strict=False)):
@@ -284,19 +266,31 @@ def _over_time(
     return figure, every[: len(colours)]
 
 
-def _steps(axes: Axes, values: Floats, **look: Any) -> None:
+def _steps(axes: Axes, values: Floats, **style: Any) -> None:
     kept = np.sort(values[np.isfinite(values)])
     share = 100 * np.arange(1, len(kept) + 1) / len(kept)
-    axes.step(np.concatenate((kept[:1], kept)), np.concatenate(([0], share)), where="post", **look)
+    axes.step(np.concatenate((kept[:1], kept)), np.concatenate(([0], share)), where="post", **style)
 
 
-def _uavs(flown: Flown) -> list[tuple[float, float, float]]:
-    return [(r, g, b) for r, g, b in uav_colours(flown.tables.scenario.arena.n_uavs).tolist()]
+def _uavs(one: Runs) -> list[tuple[float, float, float]]:
+    return [(r, g, b) for r, g, b in uav_colours(one.error.shape[2]).tolist()]
 
 
 def _name(i: int) -> str:
     return f"UAV-{i + 1}"
 
 
-def _time(flown: Flown) -> Floats:
-    return np.arange(flown.tables.scenario.horizon) * flown.tables.dt
+def _time(one: Runs) -> Floats:
+    return np.arange(one.steps) * one.dt
+
+
+FIGURES: dict[str, drawing.Drawing] = {
+    "figure_2_ablation.png": ablation,
+    "figure_3_trajectories.png": trajectories,
+    "figure_4_errors.png": errors,
+    "figure_5_rmse.png": bars,
+    "figure_6_boxes.png": boxes,
+    "figure_7_particles.png": counts,
+    "figure_8_ess.png": ess,
+    "figure_9_cdf.png": cdf,
+}

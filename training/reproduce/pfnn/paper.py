@@ -85,7 +85,7 @@ TABLE_5 = {
     "pfnn": Expense(Spread(63.4, 6.7), 63.4, 178),
 }
 
-# Figure 2: the corrections' ranges that were compared. Numbers are told of the proposed one alone.
+# Figure 2: ranges of the correction that were compared; numbers are of the proposed one only.
 RANGES = ((0.2, 1.0), (0.3, 1.0), (0.4, 1.0), (0.5, 1.0), (0.4, 1.2), (0.4, 0.9))
 PROPOSED = (0.4, 1.0)
 
@@ -99,7 +99,7 @@ MAX_GAIN_PF500 = 44.5  # %
 MAX_PARTICLES = 800
 ESS_BAND = (0.3, 0.6)
 RESAMPLED_EVERY = (10, 30)  # steps
-START_ERROR, CONVERGED_ERROR, CONVERGED_AT = 2.0, 1.0, 10.0  # m, m, s
+START_ERROR, CONVERGED_ERROR = 2.0, 1.0  # m
 SPIKES = 2.0  # m
 MEDIAN = 0.2  # m
 SUB_METRE = 1.0  # m

@@ -1,24 +1,39 @@
-"""Which agents fly in which variants, for the paper's tables and for the study of robustness."""
+"""Which agents run in which variants, for the paper's tables and for the study of robustness."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from coloc_env.motion import MOTIONS
+from training.evaluation import metrics
+from training.evaluation.evaluate import Progress
+from training.evaluation.metrics import Floats
+from training.learning.pfnn_online import learn_online
+from training.reproduce.cost import COST
 from training.reproduce.pfnn.paper import PROPOSED, RANGES
-from training.reproduce.study import Variant
+from training.reproduce.results import Runs
+from training.reproduce.settings import Settings
+from training.reproduce.store import Arrays, Facts
+from training.reproduce.work import Cell, Kind, Piece, Variant
 
 TABLE_AGENTS = ("pf500", "pf800", "apf", "ekf", "pfnn")
 ROBUST_AGENTS = (
-    "ekf",
-    "ekf:robust=gate",
-    "ekf:robust=huber",
-    "ekf_joint",
-    "pf500",
-    "pf800",
-    "apf",
-    "pfnn",
-    "ekf_trust",
-    "pf_trust",
+    *("ekf", "ekf:robust=gate", "ekf:robust=huber", "ekf_joint", "pf500", "pf800", "apf", "pfnn"),
+    *("ekf_trust", "pf_trust"),
+)
+ABLATION = {  # agents of figure 2 with their ranges; the proposed range is ``pfnn`` as it comes
+    "pfnn" if span == PROPOSED else f"pfnn:correction={span[0]:g},{span[1]:g}": span
+    for span in RANGES
+}
+DEFAULT, FIGURE_9 = "default", "figure 9"  # cells
+STEADY = 10.0  # s: from here on a filter has settled
+ONLINE = Kind(
+    "online",
+    f"{__name__}:compute_online",
+    f"{__name__}:load_online",
+    ("training.learning.pfnn_online",),
 )
 _FULL = (
     *("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20"),
@@ -26,67 +41,109 @@ _FULL = (
 )
 
 
-def ablation_agents() -> dict[str, tuple[float, float]]:
-    """Agents of figure 2 with their ranges; the proposed range is ``pfnn`` as it comes."""
-    return {
-        "pfnn" if span == PROPOSED else f"pfnn:correction={span[0]:g},{span[1]:g}": span
-        for span in RANGES
-    }
+def paper(settings: Settings) -> Iterator[Cell]:
+    """The paper's experiment: tables over the runs, figure 9 over half as many more, the corrector
+    learning in flight, costs."""
+    (default, *_), runs = variants(settings.steps), settings.runs
+    yield Cell(default, tuple(dict.fromkeys((*TABLE_AGENTS, *ABLATION))), runs)
+    yield Cell(default, TABLE_AGENTS, max(1, runs + runs // 2), key=FIGURE_9)
+    yield Cell(default, ("pfnn",), runs, ONLINE)
+    yield Cell(default, TABLE_AGENTS, 1, COST)
 
 
-def default(steps: int | None = None) -> Variant:
-    """The paper's own experiment."""
-    return _variant("default", "default", steps)
+def robustness(settings: Settings) -> Iterator[Cell]:
+    """Agents that are asked for, or the usual ones, in every variant."""
+    agents = robust_agents(settings)
+    for variant in variants(settings.steps):
+        yield Cell(variant, agents, settings.fraction(_divisor(variant)))
+
+
+def robust_agents(settings: Settings) -> tuple[str, ...]:
+    """Of the study of robustness: any that are asked for."""
+    return ROBUST_AGENTS if settings.agents is None else tuple(settings.agents)
 
 
 def variants(steps: int | None = None) -> list[Variant]:
-    """The study of robustness: one difficulty at a time, several, and worlds unlike those that
+    """The paper's own experiment, one difficulty at a time, several, and worlds unlike those that
     learned parts were trained on."""
+
+    def indoor(key: str, title: str, **overrides: Any) -> Variant:
+        return Variant(key, title, tuple(overrides.items()), steps=steps)
+
     few = {"landmarks": 5}
     hard = few | {"nlos": 0.3, "false_matches": 0.1}
     away = {"n_uavs": 8, "room": (20.0, 30.0, 4.0), "landmarks": 12}
-    found = [
-        default(steps),
-        _variant("uniform", "uniform prior", steps, prior="uniform"),
-        _variant("nlos", "NLOS 30 %", steps, nlos=0.3),
-        _variant("false", "false 10 %", steps, false_matches=0.1),
-        _variant("few", "5 landmarks", steps, **few),
-        _variant("dropout", "drop-out 50 %", steps, landmark_dropout=0.5),
-        _variant("blind6", "6 s blind", steps, range_only=(40.0, 46.0)),
-        _variant("blind20", "20 s blind", steps, range_only=(40.0, 60.0)),
-        _variant("few-nlos", "5 landmarks + NLOS", steps, **few, nlos=0.3),
-        _variant("few-nlos-false", "5 landmarks + NLOS + false", steps, **hard),
-        _variant("hard", "all hard", steps, **hard, prior="uniform", landmark_dropout=0.5),
-    ]
-    for motion in MOTIONS:
-        if motion != "circle":
-            found.append(_variant(motion, motion.replace("_", " "), steps, motion=motion))
-    found += [
-        _variant("uavs8", "8 UAVs", steps, n_uavs=8),
-        _variant("room", "room 20×30×4 m", steps, room=away["room"]),
-        _variant("landmarks12", "12 landmarks", steps, landmarks=12),
-        _variant("away", "8 UAVs, room, 12 landmarks", steps, **away),
-        _variant(
-            "away-nlos-false", "the same + NLOS + false", steps, **away, nlos=0.3, false_matches=0.1
+    return [
+        indoor(DEFAULT, "default"),
+        indoor("uniform", "uniform prior", prior="uniform"),
+        indoor("nlos", "NLOS 30 %", nlos=0.3),
+        indoor("false", "false 10 %", false_matches=0.1),
+        indoor("few", "5 landmarks", **few),
+        indoor("dropout", "drop-out 50 %", landmark_dropout=0.5),
+        indoor("blind6", "6 s blind", range_only=(40.0, 46.0)),
+        indoor("blind20", "20 s blind", range_only=(40.0, 60.0)),
+        indoor("few-nlos", "5 landmarks + NLOS", **few, nlos=0.3),
+        indoor("few-nlos-false", "5 landmarks + NLOS + false", **hard),
+        indoor("hard", "all hard", **hard, prior="uniform", landmark_dropout=0.5),
+        *(
+            indoor(motion, motion.replace("_", " "), motion=motion)
+            for motion in MOTIONS
+            if motion != "circle"
+        ),
+        indoor("uavs8", "8 UAVs", n_uavs=8),
+        indoor("room", "room 20×30×4 m", room=away["room"]),
+        indoor("landmarks12", "12 landmarks", landmarks=12),
+        indoor("away", "8 UAVs, room, 12 landmarks", **away),
+        indoor(
+            "away-nlos-false", "the same + NLOS + false", **away, nlos=0.3, false_matches=0.1
         ),
         Variant("mrclam", "MRCLAM (real)", (), "replay-mrclam-v0", steps),
         Variant("euroc", "EuRoC (real)", (), "replay-euroc-v0", steps),
-    ]
-    return found
+    ]  # fmt: skip
 
 
-def runs_in(variant: Variant, runs: int) -> int:
+def _divisor(variant: Variant) -> int:
     """Half the runs for motions and places that bring no difficulty of their own; a quarter for
     recordings, which differ in the prior's draw alone."""
     if variant.scenario.startswith("replay"):
-        return max(1, runs // 4)
-    return runs if variant.key in _FULL else max(1, runs // 2)
+        return 4
+    return 1 if variant.key in _FULL else 2
 
 
-def chosen(agents: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
-    """Those of a part's agents that are wanted; all, if nothing is said."""
-    return [agent for agent in agents if wanted is None or agent in wanted]
+# ------------------------------------------------------------------ learning in flight
 
 
-def _variant(key: str, title: str, steps: int | None, **overrides: Any) -> Variant:
-    return Variant(key, title, tuple(overrides.items()), steps=steps)
+@dataclass(frozen=True, eq=False)
+class Online:
+    """The corrector learning while it is used: ``error`` (m) and ``count`` of particles [R, K, N],
+    ``loss`` [R, L] before each training."""
+
+    error: Floats
+    count: Floats
+    loss: Floats
+
+
+def compute_online(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+    """The paper's own experiment: the corrector learns from the truth in flight."""
+    found = learn_online(piece.variant.build(), piece.runs, piece.seed, progress)
+    return {key: getattr(found, key).numpy() for key in ("error", "count", "loss")}, {}
+
+
+def load_online(variant: Variant, arrays: Arrays, facts: Facts) -> Online:
+    """What ``compute_online`` made."""
+    return Online(**arrays)
+
+
+# ------------------------------------------------------------------ measures
+
+
+def particles(one: Runs) -> Floats:
+    """[R]: mean count; NaN for what has no particles."""
+    values = one.record.series.get("particles")
+    return np.array([np.nan]) if values is None else metrics.mean_per_run(values, one.scored)
+
+
+def steady(one: Runs) -> slice:
+    """The steps after the first 10 s; all of a run that is shorter."""
+    first = round(STEADY / one.dt)
+    return slice(first if first < one.steps else 0, None)

@@ -1,10 +1,12 @@
-"""Single runs in which links are looked at: what weight each had, and how fast feedback moves it.
+"""Single runs whose links are recorded: what weight each had, and how fast feedback moves it.
 
-What a localizer gives its links is no part of its estimate, so these runs are flown by themselves.
+What a localizer gives its links is no part of its estimate, so these runs are recorded here.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,23 +15,23 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from agents.localizer import Localizer
 from agents.registry import make
 from agents.swarm.filter import SwarmFilter
 from coloc_env.geometry.walls import depth
-from coloc_env.world import World
-from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Flags, Floats
-from training.reproduce.identity import code_of
-from training.reproduce.store import Arrays, Store
-from training.reproduce.study import Piece, Variant
+from training.evaluation.rollout import rollout
+
+if TYPE_CHECKING:
+    from training.evaluation.evaluate import Progress
+    from training.reproduce.store import Arrays, Facts
+    from training.reproduce.work import Piece, Variant
 
 LOW = 0.2  # weight below which the paper calls a link cut off
 _APART = 5.0  # s without NLOS that end an event
 
 
 @dataclass(frozen=True, eq=False)
-class Watched:
+class Links:
     """A run of K steps of N UAVs: ``error`` [K, N] m, NaN of anchors; between all pairs [K, N, N]
     the true ``length`` m, whether a wall is between (``blocked``), the ``range`` m (NaN: none), and
     the ``weight`` of the link as a multiple of that of a range with the believed noise; ``dt`` s.
@@ -48,7 +50,7 @@ class Watched:
         linked = np.isfinite(self.range)
         return np.array([connected_components(each, directed=False)[0] for each in linked])
 
-    def event(self) -> "Event | None":
+    def event(self) -> Event | None:
         """Of all times that a wall came between two UAVs which had measured each other before, that
         with the most ranges; None if there is none. Links between anchors do not count."""
         known, apart = np.isfinite(self.range), max(1, round(_APART / self.dt))
@@ -66,7 +68,7 @@ class Watched:
                     best, count = (int(i), int(j), int(part[0]), int(part[-1])), len(part)
         return None if best is None else Event(*best)
 
-    def fall(self, event: "Event") -> float:
+    def fall(self, event: Event) -> float:
         """Seconds from an event's first range until the link's weight is below ``LOW``; infinity if
         it never is while the event lasts."""
         weight = self.weight[event.first : event.last + 1, event.i, event.j]
@@ -74,7 +76,7 @@ class Watched:
         low = np.flatnonzero(measured & (weight < LOW))
         return self.dt * float(low[0]) if len(low) else float("inf")
 
-    def peak(self, event: "Event") -> float:
+    def peak(self, event: Event) -> float:
         """Largest error (m) of an event's UAVs from its first range to 5 s after its last."""
         last = event.last + max(1, round(_APART / self.dt))
         return float(np.nanmax(self.error[event.first : last + 1, [event.i, event.j]]))
@@ -99,93 +101,67 @@ class Loop:
     mean: Floats
 
 
-def watched(
-    store: Store, variant: Variant, agent: str, seed: int, tell: Progress, missing: bool
-) -> Watched | None:
-    """A run, from the store if it is there; None if it is not and nothing is ``missing``."""
-    found = _stored(store, "links", variant, agent, seed, tell, missing)
-    return None if found is None else Watched(**found, dt=variant.build().arena.dt)
-
-
-def loop(
-    store: Store, variant: Variant, agent: str, seed: int, tell: Progress, missing: bool
-) -> Loop | None:
-    """The same for an agent that feeds confidences back."""
-    found = _stored(store, "loop", variant, agent, seed, tell, missing)
-    return None if found is None else Loop(**found)
-
-
-def _stored(
-    store: Store, kind: str, variant: Variant, agent: str, seed: int, tell: Progress, missing: bool
-) -> Arrays | None:
-    piece = Piece(variant, agent, seed, 1)
-    localizer = make(agent, variant.build())
-    name = f"{piece.name}-{kind}"
-    settings = piece.settings() | {"code": code_of(localizer, "training.reproduce.stdcl.links")}
-    if not store.has(name, settings):
-        if not missing:
-            return None
-        look = {"links": _fly_links, "loop": _fly_loop}[kind]
-        store.save(name, settings, look(localizer, variant, seed, tell), {})
-    arrays, _ = store.load(name, settings)
-    return arrays
-
-
-@torch.no_grad()
-def _fly_links(localizer: Localizer, variant: Variant, seed: int, tell: Progress) -> Arrays:
-    scenario = variant.build()
+def record_links(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+    """A run with what happens on every link."""
+    scenario, (agent,) = piece.variant.build(), piece.agents
     steps, n = scenario.horizon, scenario.arena.n_uavs
-    world = World(scenario)
-    observation = world.reset(seed)
-    belief, weights = localizer.reset(observation), _Weights(localizer)
+    localizer = make(agent, scenario)
+    weights = _Weights(localizer)
     arrays = {key: np.full((steps, n, n), np.nan) for key in ("length", "range", "weight")}
     arrays["blocked"] = np.zeros((steps, n, n), bool)
     arrays["error"] = np.zeros((steps, n))
-    for k in range(steps):
-        belief, estimate = localizer.step(belief, observation)
-        there = observation["range_mask"][0].numpy() > 0
-        arrays["range"][k] = np.where(there, observation["ranges"][0].numpy(), np.nan)
-        truth = world.truth.position[0]
+    for step in rollout(localizer, scenario, torch.tensor([piece.seed])):
+        k, truth = step.k, step.world.truth.position[0]
+        there = step.observation["range_mask"][0].numpy() > 0
+        arrays["range"][k] = np.where(there, step.observation["ranges"][0].numpy(), np.nan)
         arrays["length"][k] = torch.cdist(truth, truth).numpy()
         arrays["blocked"][k] = depth(truth.unsqueeze(1), truth, scenario.network.walls).numpy() > 0
         arrays["weight"][k] = weights.last[:n, :n]
-        arrays["error"][k] = (estimate.position[0] - truth).norm(dim=-1).numpy()
-        world.advance(estimate.action())
-        observation = world.observation()
-        tell("links", k + 1, steps)
+        assert step.estimate is not None
+        arrays["error"][k] = (step.estimate.position[0] - truth).norm(dim=-1).numpy()
+        progress(agent, k + 1, steps)
     arrays["error"][:, : scenario.anchor_uavs] = np.nan
-    return arrays
+    return arrays, {}
 
 
-@torch.no_grad()
-def _fly_loop(localizer: Localizer, variant: Variant, seed: int, tell: Progress) -> Arrays:
-    scenario = variant.build()
-    world = World(scenario)
-    observation = world.reset(seed)
-    belief: Any = localizer.reset(observation)
+def load_links(variant: Variant, arrays: Arrays, facts: Facts) -> Links:
+    """What ``record_links`` made."""
+    return Links(**arrays, dt=variant.build().arena.dt)
+
+
+def record_loop(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+    """A run of an agent that feeds confidences back: how they change."""
+    scenario, (agent,) = piece.variant.build(), piece.agents
     change, mean = np.zeros(scenario.horizon), np.zeros(scenario.horizon)
-    for k in range(scenario.horizon):
-        before = belief.confidence
-        belief, estimate = localizer.step(belief, observation)
-        change[k] = float((belief.confidence / before - 1).abs().max())
-        mean[k] = float(belief.confidence[observation["range_mask"] > 0].mean())
-        world.advance(estimate.action())
-        observation = world.observation()
-        tell("loop", k + 1, scenario.horizon)
-    return {"change": change, "mean": mean}
+    localizer, seeds = make(agent, scenario), torch.tensor([piece.seed])
+    before: Any = None
+    for step in rollout(localizer, scenario, seeds):
+        if before is None:
+            before = localizer.reset(step.observation)
+        confidence = step.belief.confidence
+        change[step.k] = float((confidence / before.confidence - 1).abs().max())
+        mean[step.k] = float(confidence[step.observation["range_mask"] > 0].mean())
+        before = step.belief
+        progress(agent, step.k + 1, scenario.horizon)
+    return {"change": change, "mean": mean}, {}
+
+
+def load_loop(variant: Variant, arrays: Arrays, facts: Facts) -> Loop:
+    """What ``record_loop`` made."""
+    return Loop(**arrays)
 
 
 class _Weights:
-    """Listens to the weights that a swarm filter, or the one inside a loop, gives its links."""
+    """Keeps the last weights that a swarm filter, or the one inside a loop, gave its links."""
 
     def __init__(self, localizer: Any) -> None:
         base: SwarmFilter = getattr(localizer, "base", localizer)
         weights, variance = base.weights, base.std**2
         self.last: Floats = np.zeros((0, 0))
 
-        def heard(*given: Any) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+        def recorded(*given: Any) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
             weight, shift = weights(*given)
             self.last = variance * weight[0].numpy()
             return weight, shift
 
-        base.weights = heard  # type: ignore[method-assign, assignment]
+        base.weights = recorded  # type: ignore[method-assign, assignment]

@@ -1,25 +1,25 @@
-"""Who flies where: the paper's simulations, stress, the learned part, the campus, recordings."""
+"""Who runs where: the paper's simulations, stress, the learned part, the campus, recordings."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-from training.reproduce.study import BOUNDS, WORLD, Piece, Study, Variant
+from training.reproduce.cost import COST
+from training.reproduce.settings import Settings
+from training.reproduce.work import POSTERIOR, SNAPSHOT, Cell, Kind, Variant
 
 TITLE = "Spatio-temporally decoupled cooperative localization, *Drones* 2026, 10(1), 69"
-PARTS = ("paper", "stress", "learned", "campus", "real")
 WHOLE, OPTIMIZER, HUBER = "stdcl", "dwmds_st", "dwmds_st:confidence=huber"
 RIVALS = ("mds", "fcmds", "dwmds", "vmds")  # the paper's, in its order
 LEARNED = "stgat"
 METHODS = (*RIVALS, LEARNED, HUBER, OPTIMIZER, WHOLE)
-REFERENCES = ("gn", "map")  # dear: they fly in fewer worlds
-POSTERIOR, SNAPSHOT = BOUNDS
-# Step by step from the optimizer to the whole, each with weights trained as it is flown.
+REFERENCES = ("gn", "map")  # expensive: they run in fewer worlds
+# Step by step from the optimizer to the whole, each with weights trained as it is used.
 ABLATION = {
     OPTIMIZER: "DW-MDS alone",
     "stdcl:weights=stdcl_attention": "+ attention, fed back",
     WHOLE: "+ convolutions: whole",
 }
-OPEN = "stdcl:weights=stdcl_open:feedback=none"  # trained with the loop open, flown so
+OPEN = "stdcl:weights=stdcl_open:feedback=none"  # trained with the loop open, used so
 UNFED = "stdcl:feedback=none"  # the whole's own weights, with the loop cut
 PAPERS_FEEDBACK = "stdcl:feedback=paper"
 CLOSED_AFTERWARDS = "stdcl:weights=stdcl_open:feedback=positions"
@@ -39,93 +39,23 @@ SPARSE = (1230.0, 1500.0, 1750.0, 2000.0, 2500.0, 3500.0)  # m: degree 2.5 to 35
 FAILURES = (0.25, 0.4)
 GROWTH = (20, 50, 100, 200, 500, 1000)
 JOINT_UP_TO = 200  # UAVs: beyond, full covariances are not timed
+CONFIDENCES_OF = tuple(f"{OPTIMIZER}:confidence={c}" for c in CONFIDENCES)
+WATCHED = (WHOLE, OPTIMIZER, f"{OPTIMIZER}:confidence=none")  # whose links are recorded
 FLIGHTS = {"s1": "S1: formation over the court", "s2": "S2: split", "s3": "S3: patrol"}
 LONG = 1000  # steps of the loop's long run
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A variant and who flies in it: ``agents`` in ``runs`` worlds, ``few`` in the first ``some``
-    of them; ``bounds`` over the first ``bounded``."""
-
-    variant: Variant
-    agents: tuple[str, ...]
-    runs: int
-    few: tuple[str, ...] = ()
-    some: int = 0
-    bounds: tuple[str, ...] = ()
-    bounded: int = 1
-
-    @property
-    def blocks(self) -> tuple[int, ...]:
-        """Runs of each piece; the first one is what ``few`` fly."""
-        first = self.some or self.runs
-        return (first, self.runs - first) if first < self.runs else (self.runs,)
-
-    def pieces(self, study: Study) -> Iterator[Piece]:
-        """All that is to be computed."""
-        for agent in (WORLD, *self.agents):
-            yield from study.pieces(self.variant, agent, *self.blocks)
-        for agent in self.few:
-            yield from study.pieces(self.variant, agent, self.blocks[0])
-        for which in self.bounds:
-            yield from study.pieces(self.variant, which, self.bounded)
-
-
-def merged(scenes: Iterable[Scene]) -> dict[str, Scene]:
-    """Scenes by their variant's key; several of one variant become one, in which those who fly in
-    fewer worlds are ``few``."""
-    found: dict[str, Scene] = {}
-    for scene in scenes:
-        key = scene.variant.key
-        found[key] = _together(found[key], scene) if key in found else scene
-    return found
-
-
-def _together(a: Scene, b: Scene) -> Scene:
-    many, other = (a, b) if a.runs >= b.runs else (b, a)
-    alike = many.runs == other.runs
-    agents = tuple(dict.fromkeys((*many.agents, *(other.agents if alike else ()))))
-    few = (*many.few, *other.few, *(() if alike else other.agents))
-    return replace(
-        many,
-        agents=agents,
-        few=tuple(agent for agent in dict.fromkeys(few) if agent not in agents),
-        some=min(many.blocks[0], other.blocks[0]),
-        bounds=tuple(dict.fromkeys((*many.bounds, *other.bounds))),
-        bounded=max(s.bounded for s in (many, other)),
-    )
+_LINKS = "training.reproduce.stdcl.links"
+LINKS = Kind("links", f"{_LINKS}:record_links", f"{_LINKS}:load_links", (_LINKS,))
+LOOP = Kind("loop", f"{_LINKS}:record_loop", f"{_LINKS}:load_loop", (_LINKS,))
 
 
 @dataclass(frozen=True)
-class Plan:
-    """All scenes of a study of ``runs`` worlds, at most ``steps`` long, of swarms of ``n_uavs``."""
+class Worlds:
+    """The variants, at most ``steps`` long, with swarms of ``n_uavs`` where that is not varied."""
 
-    runs: int
-    steps: int | None = None
     n_uavs: int = 200
-
-    @property
-    def some(self) -> int:
-        """Runs of what is dear, and beyond the main table: five of fifty."""
-        return max(1, self.runs // 10)
-
-    @property
-    def bounded(self) -> int:
-        """Runs of the bounds of swarms, which differ little between worlds."""
-        return max(1, self.runs // 25)
-
-    def scenes(self, part: str) -> list[Scene]:
-        """Of one of ``PARTS``."""
-        return {
-            "paper": self.paper,
-            "stress": self.stress,
-            "learned": self.learned,
-            "campus": self.campus,
-            "real": self.real,
-        }[part]()
-
-    # ---------------------------------------------------------------- variants
+    steps: int | None = None
 
     def swarm(self, key: str, title: str, **overrides: float | str) -> Variant:
         """``swarm-v0`` with overrides."""
@@ -232,88 +162,98 @@ class Plan:
         overrides = (("flight", "s2"), ("horizon", 100))
         return Variant("time-campus", "ten UAVs", overrides, "campus-v0", self.steps)
 
-    # ---------------------------------------------------------------- scenes
-
-    def paper(self) -> list[Scene]:
-        """Figures 4 to 9."""
-        found = [
-            self._swarm(self.speed(v_max), METHODS, self.runs, bounded=self.some)
-            for v_max in (FAST, MODERATE)
-        ]
-        found += [self._swarm(self.layout(name), METHODS) for name in ("u", "o")]
-        return found + [self._swarm(self.radius(metres), METHODS) for metres in RADII]
-
-    def stress(self) -> list[Scene]:
-        """Figures 10 and 11, and more of the kind."""
-        confidences = tuple(f"{OPTIMIZER}:confidence={c}" for c in CONFIDENCES)
-        nlos = [self._stressed(self.share(x), confidences) for x in SHARES]
-        others = [
-            *(self.tail(x) for x in TAILS),
-            *(self.lasting(x) for x in (0.15, 0.5)),
-            *(self.sparse(x) for x in SPARSE),
-            *(self.failing(x) for x in FAILURES),
-            self.stressed("nodes-0.3", "nodes failing 30 % a run", failure_rate=0.3),
-            *(self.drifting(x) for x in (0.3, 1.0)),
-        ]
-        return nlos + [self._stressed(variant) for variant in others]
-
-    def learned(self) -> list[Scene]:
-        """What each part of the network adds, what the loop does, and whether it is stable."""
-        agents = (HUBER, *ABLATION, *LOOPS)
-        where = [self.speed(MODERATE), *self.held_out().values()]
-        found = [Scene(v, agents, self.some) for v in where]
-        return [*found, Scene(self.long(), (OPTIMIZER, WHOLE, UNFED), self.some)]
-
-    def campus(self) -> list[Scene]:
-        """Section 6's flights, simulated."""
-        agents = (*METHODS, *REFERENCES)
-        count = {"s1": 2 * self.some, "s2": 2 * self.some, "s3": self.some}
-        return [Scene(self.flight(name), agents, count[name]) for name in FLIGHTS]
-
-    def real(self) -> list[Scene]:
-        """Recordings; runs differ in what is drawn at their start."""
-        agents = (*METHODS, *REFERENCES, "ekf")
+    def recordings(self) -> list[Variant]:
+        """Four ground robots, with and without velocities, and three UAVs."""
         later = ("span", (60.0, 208.0))  # on the first minute noise settings were chosen
+        slow = (("process", "constant_velocity"), ("anchor_robots", (5, 4)))
         return [
-            Scene(
-                Variant(key, title, overrides, scenario, self.steps, bounded=False),
-                agents,
-                self.some,
-            )
-            for key, title, scenario, overrides in (
-                ("tiers", "TIERS: four ground robots", "replay-tiers-v0", (later,)),
-                (
-                    "tiers-cv",
-                    "TIERS without velocities",
-                    "replay-tiers-v0",
-                    (later, ("process", "constant_velocity"), ("anchor_robots", (5, 4))),
-                ),
-                ("miluv", "MILUV: three UAVs", "replay-miluv-v0", ()),
+            Variant(key, title, overrides, f"replay-{name}-v0", self.steps, bounded=False)
+            for key, title, name, overrides in (
+                ("tiers", "TIERS: four ground robots", "tiers", (later,)),
+                ("tiers-cv", "TIERS without velocities", "tiers", (later, *slow)),
+                ("miluv", "MILUV: three UAVs", "miluv", ()),
             )
         ]
 
-    def _swarm(
-        self, variant: Variant, agents: tuple[str, ...], runs: int = 0, bounded: int = 0
-    ) -> Scene:
-        """With the references in a few worlds, and the bounds."""
-        return Scene(
-            variant,
-            agents,
-            runs or self.some,
-            REFERENCES,
-            self.some,
-            (POSTERIOR, SNAPSHOT),
-            bounded or self.bounded,
-        )
 
-    def _stressed(self, variant: Variant, beside: tuple[str, ...] = ()) -> Scene:
+W = Worlds()  # for the variants' keys and titles
+
+
+def _worlds(n_uavs: int, settings: Settings) -> Worlds:
+    return Worlds(n_uavs, settings.steps)
+
+
+def paper(n_uavs: int, settings: Settings) -> Iterator[Cell]:
+    """Figures 4 to 9, and what steps cost."""
+    worlds, some = _worlds(n_uavs, settings), settings.fraction(10)
+    for v_max in (FAST, MODERATE):
+        yield from _bounded(worlds.speed(v_max), METHODS, settings.runs, settings, some)
+    others = [*(worlds.layout(x) for x in ("u", "o")), *(worlds.radius(x) for x in RADII)]
+    for variant in others:
+        yield from _bounded(variant, METHODS, some, settings)
+    for n in GROWTH:
+        joint = REFERENCES if n <= JOINT_UP_TO else ()
+        yield Cell(worlds.timed(n), (*METHODS, *joint), 1, COST)
+
+
+def stress(n_uavs: int, settings: Settings) -> Iterator[Cell]:
+    """Figures 10 and 11, and more of the kind."""
+    for variant in stressed(_worlds(n_uavs, settings)):
+        beside = CONFIDENCES_OF if variant.key.startswith("nlos-") else ()
         agents = tuple(dict.fromkeys((*METHODS, *beside)))
-        return Scene(
-            variant,
-            agents,
-            self.some,
-            ("map",),
-            self.some,
-            (POSTERIOR, SNAPSHOT),
-            self.bounded,
-        )
+        yield from _bounded(variant, agents, settings.fraction(10), settings, few=("map",))
+
+
+def stressed(worlds: Worlds) -> list[Variant]:
+    """The variants under stress."""
+    return [
+        *(worlds.share(x) for x in SHARES),
+        *(worlds.tail(x) for x in TAILS),
+        *(worlds.lasting(x) for x in (0.15, 0.5)),
+        *(worlds.sparse(x) for x in SPARSE),
+        *(worlds.failing(x) for x in FAILURES),
+        worlds.stressed("nodes-0.3", "nodes failing 30 % a run", failure_rate=0.3),
+        *(worlds.drifting(x) for x in (0.3, 1.0)),
+    ]
+
+
+def learned(n_uavs: int, settings: Settings) -> Iterator[Cell]:
+    """What each part of the network adds, what the loop does, and whether it is stable."""
+    worlds, some = _worlds(n_uavs, settings), settings.fraction(10)
+    for variant in (worlds.speed(MODERATE), *worlds.held_out().values()):
+        yield Cell(variant, (HUBER, *ABLATION, *LOOPS), some)
+    yield Cell(worlds.long(), (OPTIMIZER, WHOLE, UNFED), some)
+    yield Cell(worlds.long(), (WHOLE,), 1, LOOP)
+
+
+def campus(n_uavs: int, settings: Settings) -> Iterator[Cell]:
+    """Section 6's flights, simulated; single runs whose links are recorded."""
+    worlds, some = _worlds(n_uavs, settings), settings.fraction(10)
+    for name in FLIGHTS:
+        count = some if name == "s3" else 2 * some
+        yield Cell(worlds.flight(name), (*METHODS, *REFERENCES), count)
+    yield Cell(worlds.timed_flight(), (*METHODS, *REFERENCES), 1, COST)
+    yield Cell(worlds.lighter(), WATCHED, 1, LINKS)
+    yield Cell(worlds.flight("s2"), (OPTIMIZER,), 1, LINKS)
+
+
+def real(n_uavs: int, settings: Settings) -> Iterator[Cell]:
+    """Recordings; runs differ in what is drawn at their start."""
+    for variant in _worlds(n_uavs, settings).recordings():
+        yield Cell(variant, (*METHODS, *REFERENCES, "ekf"), settings.fraction(10))
+
+
+def _bounded(
+    variant: Variant,
+    agents: tuple[str, ...],
+    runs: int,
+    settings: Settings,
+    bounded: int = 0,
+    few: tuple[str, ...] = REFERENCES,
+) -> Iterator[Cell]:
+    """With expensive agents in a ``few`` worlds, and the bounds, which differ little between
+    worlds."""
+    yield Cell(variant, agents, runs)
+    yield Cell(variant, few, settings.fraction(10))
+    for kind in (POSTERIOR, SNAPSHOT):
+        yield Cell(variant, (), bounded or settings.fraction(25), kind)

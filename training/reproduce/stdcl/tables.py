@@ -1,22 +1,42 @@
-"""The report's tables, as a header and lines."""
+"""The tables: errors beside bounds, what each part adds, campus and recordings, times."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from coloc_env.bounds import SnapshotBound
 from training.evaluation import metrics
-from training.evaluation.metrics import Difference
 from training.evaluation.tables import short
-from training.reproduce.cost import Cost
-from training.reproduce.reporting import DASH, Table, difference, ends
+from training.reproduce.cost import COST, Cost
+from training.reproduce.measures import quantile, rmse, rmse_of_all, rmse_of_bound
+from training.reproduce.results import Results, Runs
+from training.reproduce.settings import Settings
 from training.reproduce.stdcl import plan
-from training.reproduce.stdcl.flown import Flown, Teams
 from training.reproduce.stdcl.links import Loop
-from training.reproduce.stdcl.measures import Runs, better, told_by
-from training.reproduce.stdcl.plan import POSTERIOR, SNAPSHOT, Scene
-from training.reproduce.study import WORLD
-from training.reproduce.verdicts import interval
+from training.reproduce.stdcl.measures import (
+    ate,
+    better,
+    drift,
+    fge,
+    nrmse,
+    nrmse_of_all,
+    radius,
+    ratio_to,
+    ratio_to_alone,
+)
+from training.reproduce.stdcl.plan import LOOP, W
+from training.reproduce.tables import (
+    DASH,
+    Table,
+    by_agent,
+    lost,
+    nees,
+    number,
+    numbered,
+    signed,
+    with_ends,
+)
+from training.reproduce.work import POSTERIOR, SNAPSHOT, WORLD, Variant
 
 PAPER_NRMSE = {plan.FAST: 0.0077, plan.MODERATE: 0.0068}
 PAPER_MS = {"dwmds": 28.0, "stdcl": 36.0}  # N = 200, MATLAB, i7-12700K
@@ -25,200 +45,210 @@ PAPER_FGE = {("s2", "stdcl"): 1.52, ("s2", "vmds"): 2.45, ("s2", "dwmds"): 3.01}
 GROWS_FROM = 100  # UAVs: smaller swarms cost what calls cost
 
 
-def averages(found: Mapping[float, Teams], flown: Flown, keys: Mapping[float, str]) -> Table:
-    """Figure 6's averages: NRMSE with its interval, RMSE, and what is between it and the bounds."""
+def paper_text(settings: Settings) -> list[str]:
+    """What is to be known of the simulations."""
+    some = settings.fraction(10)
+    return [f"`swarm-v0`; {settings.runs} runs of the main table, {some} of the others."]
+
+
+def stress_text(settings: Settings) -> list[str]:
+    """What is to be known of the cases under stress."""
+    runs = settings.fraction(10)
+    return [f"v_max 50 m/s, {runs} runs; INS without bias unless one is given."]
+
+
+def learned_text(settings: Settings) -> list[str]:
+    """What is to be known of the learned part."""
+    return [f"INS bias 0.3 m/s, 15 % NLOS, {settings.fraction(10)} runs."]
+
+
+def campus_text(settings: Settings) -> list[str]:
+    """What is to be known of the campus."""
+    return ["The paper's Jetson Nano (45 ms for ST-DCL) is not at hand; this machine's is below."]
+
+
+def real_text(settings: Settings) -> list[str]:
+    """What is to be known of the recordings."""
+    return ["Runs differ in what is drawn at their start."]
+
+
+def paper(results: Results) -> Iterator[Table]:
+    """Figure 6's averages, other worlds, times."""
+    yield _averages(results)
+    others = [*(W.layout(x) for x in ("u", "o")), *(W.radius(x) for x in plan.RADII)]
+    yield _errors("Layouts and radii", others, results)
+    at = results.kinds(W.timed(200).key, COST)
+    caption = "Whole team, one thread, all methods step by step in turn."
+    yield _costs("Time of a step, N = 200", at, PAPER_MS, caption)
+    yield _growth({n: results.kinds(W.timed(n).key, COST) for n in plan.GROWTH})
+
+
+def stress(results: Results) -> Iterator[Table]:
+    """Every case."""
+    yield _errors("Every case", plan.stressed(W), results)
+
+
+def learned(results: Results) -> Iterator[Table]:
+    """What the network adds, and whether the loop is stable."""
+    yield _ablation((W.speed(plan.MODERATE), *W.held_out().values()), results)
+    yield _stability(results)
+
+
+def _averages(results: Results) -> Table:
+    """NRMSE with its interval, RMSE, and what is between it and the bounds."""
     header = ["v_max (m/s)", "agent", "NRMSE (95 %)", "paper", "RMSE (m)", "median (m)"]
     header += ["90 % (m)", "× bound with motion", "NEES", "runs lost"]
-    lines = []
-    for v_max, there in found.items():
-        bound = flown.bound(keys[v_max], POSTERIOR)
-        for which, name in ((SNAPSHOT, "CRLB of a snapshot"), (POSTERIOR, "bound with motion")):
-            known = flown.bound(keys[v_max], which)
+    rows = []
+    for v_max in (plan.FAST, plan.MODERATE):
+        key = W.speed(v_max).key
+        there, bound = results.runs(key), results.get(key, "", POSTERIOR)
+        for kind, name in ((SNAPSHOT, "CRLB of a snapshot"), (POSTERIOR, "bound with motion")):
+            known = results.get(key, "", kind)
             if known is not None and there:
-                reach = next(iter(there.values())).radius
-                start = [f"{v_max:g}", name, number(told_by(known) / reach, "{:.6f}"), ""]
-                lines.append([*start, number(told_by(known)), "", "", "", "", ""])
+                allowed = rmse_of_bound(known)
+                reach = radius(next(iter(there.values())))
+                start = [f"{v_max:g}", name, number(allowed / reach, "{:.6f}"), ""]
+                rows.append([*start, number(allowed), "", "", "", "", ""])
         for agent, one in there.items():
-            paper = PAPER_NRMSE[v_max] if agent == plan.WHOLE else None
-            lines.append(
-                [
-                    f"{v_max:g}",
-                    f"`{agent}`",
-                    ends(interval(one.nrmse), "{:.6f}".format),
-                    "" if paper is None else f"{paper}",
-                    f"{one.whole:.2f}",
-                    f"{one.quantile(0.5):.2f}",
-                    f"{one.quantile(0.9):.2f}",
-                    number(one.ratio_to(bound)),
-                    nees(one),
-                    lost(one),
-                ]
-            )
-    return header, lines
+            printed = PAPER_NRMSE[v_max] if agent == plan.WHOLE else ""
+            start = [f"{v_max:g}", f"`{agent}`", with_ends(nrmse, "{:.6f}")(one), f"{printed}"]
+            figures = (rmse_of_all(one), quantile(0.5)(one), quantile(0.9)(one))
+            cells = [*map(number, (*figures, ratio_to(one, bound))), nees(one), lost(one)]
+            rows.append([*start, *cells])
+    return Table("Average NRMSE (figure 6)", header, rows, 2)
 
 
-def errors(scenes: Sequence[Scene], flown: Flown) -> Table:
-    """By variant and agent: RMSE, median, 90th percentile, as multiples of INS alone and of the
-    bound; per variant the share that is localizable from one step's ranges."""
+def _errors(title: str, variants: Iterable[Variant], results: Results) -> Table:
+    """RMSE, median, 90th percentile, as multiples of INS alone and of the bound; per variant the
+    share that is localizable from one step's ranges."""
     header = ["variant", "agent", "RMSE (m)", "NRMSE", "median (m)", "90 % (m)"]
     header += ["of INS alone", "× bound with motion", "NEES", "runs lost"]
-    lines = []
-    for scene in scenes:
-        there, key = flown.runs(scene.variant.key), scene.variant.key
-        bound, title = flown.bound(key, POSTERIOR), described(scene, flown)
-        alone = there.get(WORLD)
+    rows = []
+    for variant in variants:
+        there = results.runs(variant.key)
+        bound, words = results.get(variant.key, "", POSTERIOR), described(variant, results)
         for agent, one in there.items():
-            lines.append(
-                [
-                    title,
-                    f"`{agent}`",
-                    ends(interval(one.rmse), "{:.2f}".format),
-                    number(one.whole / one.radius, "{:.5f}"),
-                    f"{one.quantile(0.5):.2f}",
-                    f"{one.quantile(0.9):.2f}",
-                    number(of_alone(one, alone)),
-                    number(one.ratio_to(bound)),
-                    nees(one),
-                    lost(one),
-                ]
-            )
-    return header, lines
+            cells = [
+                with_ends(rmse, "{:.2f}")(one),
+                number(nrmse_of_all(one), "{:.5f}"),
+                number(quantile(0.5)(one)),
+                number(quantile(0.9)(one)),
+                number(ratio_to_alone(one, there.get(WORLD))),
+                number(ratio_to(one, bound)),
+            ]
+            rows.append([words, f"`{agent}`", *cells, nees(one), lost(one)])
+    return Table(title, header, rows, 2)
 
 
-def described(scene: Scene, flown: Flown) -> str:
+def described(variant: Variant, results: Results) -> str:
     """A variant's title with its bounds and the share that a snapshot localizes."""
-    words = [scene.variant.title]
-    known = flown.bound(scene.variant.key, POSTERIOR)
+    words, known = [variant.title], results.get(variant.key, "", POSTERIOR)
     if known is not None:
         words.append(f"bound {known.rmse:.2f} m")
-    snap = flown.bound(scene.variant.key, SNAPSHOT)
-    if isinstance(snap, SnapshotBound):
-        words.append(f"{100 * snap.share_localizable:.1f} % localizable from one step")
+    snapshot = results.get(variant.key, "", SNAPSHOT)
+    if isinstance(snapshot, SnapshotBound):
+        words.append(f"{100 * snapshot.share_localizable:.1f} % localizable from one step")
     return "; ".join(words)
 
 
-def ablation(scenes: Sequence[Scene], flown: Flown) -> Table:
+def _ablation(variants: Iterable[Variant], results: Results) -> Table:
     """What each part of the network changes, paired by world, against the optimizer alone."""
     header = ["worlds", "agent", "what it has", "RMSE (m)", "better than DW-MDS alone (%)"]
     header += ["better than the line above (%)"]
     names = {plan.HUBER: "DW-MDS alone, Huber"} | plan.ABLATION | plan.LOOPS
-    lines = []
-    for scene in scenes:
-        there = flown.runs(scene.variant.key)
+    rows = []
+    for variant in variants:
+        there = results.runs(variant.key, list(names))
         before: Runs | None = None
-        for agent, words in names.items():
-            if agent not in there:
-                continue
-            one, alone = there[agent], there.get(plan.OPTIMIZER)
+        for agent, one in there.items():
+            alone = there.get(plan.OPTIMIZER)
             gains = [
-                DASH if other is None or other is one else difference(better(one, other), 1.0, "")
+                DASH if other in (None, one) else signed(better(one, other), "")
                 for other in (alone, before if agent in plan.ABLATION else None)
             ]
-            error = ends(interval(one.rmse), "{:.2f}".format)
-            lines.append([scene.variant.title, f"`{agent}`", words, error, *gains])
+            error = with_ends(rmse, "{:.2f}")(one)
+            rows.append([variant.title, f"`{agent}`", names[agent], error, *gains])
             before = one if agent in plan.ABLATION else before
-    return header, lines
+    return Table("Step by step", header, rows, 3)
 
 
-def stability(there: Teams, loop: Loop | None) -> Table:
+def _stability(results: Results) -> Table:
     """A long run: whether errors or confidences drift."""
-    header = ["agent", "RMSE (m)", "last 100 steps ÷ steps 10–110", "largest change of a link's"]
-    header[-1] += " confidence in a step (%)"
-    lines = []
-    for agent, one in there.items():
-        change = DASH
-        if agent == plan.WHOLE and loop is not None:
-            change = f"{100 * loop.change.max():.2f}"
-        drift = ends(interval(one.drift()), "{:.3f}".format)
-        lines.append([f"`{agent}`", f"{one.whole:.2f}", drift, change])
-    return header, lines
+    header = ["agent", "RMSE (m)", "last 100 steps ÷ steps 10–110"]
+    header += ["largest change of a link's confidence in a step (%)"]
+    key, rows = W.long().key, []
+    for agent, one in results.runs(key).items():
+        if agent != WORLD:  # which drifts
+            loop: Loop | None = results.get(key, agent, LOOP)
+            change = DASH if loop is None else f"{100 * loop.change.max():.2f}"
+            cells = [f"{rmse_of_all(one):.2f}", with_ends(drift)(one), change]
+            rows.append([f"`{agent}`", *cells])
+    return Table(f"{plan.LONG} steps", header, rows)
 
 
-def flights(found: Mapping[str, Teams]) -> Table:
+def campus(results: Results) -> Iterator[Table]:
     """Table 2: ATE and FGE per flight, against the truth and against the reference that the paper
-    had."""
+    had; table 1: times."""
     header = ["flight", "agent", "FGE (m, 95 %)", "paper", "ATE (m, 95 %)", "FGE to reference (m)"]
     header += ["ATE to reference (m)", "runs lost"]
-    lines = []
-    for name, there in found.items():
-        for agent, one in there.items():
-            told = one.results.summary["agents"][agent]["diagnostics"]
-            paper = PAPER_FGE.get((name, agent))
-            lines.append(
-                [
-                    plan.FLIGHTS[name],
-                    f"`{agent}`",
-                    ends(interval(one.fge), "{:.2f}".format),
-                    "" if paper is None else f"{paper}",
-                    ends(interval(one.ate), "{:.2f}".format),
-                    short(told.get("fge_reference")),
-                    short(told.get("ate_reference")),
-                    lost(one),
-                ]
-            )
-    return header, lines
+    rows = []
+    for name, title in plan.FLIGHTS.items():
+        for agent, one in results.runs(W.flight(name).key).items():
+            printed = PAPER_FGE.get((name, agent), "")
+            found = one.summary["diagnostics"]
+            cells = [with_ends(fge, "{:.2f}")(one), f"{printed}", with_ends(ate, "{:.2f}")(one)]
+            cells += [short(found.get("fge_reference")), short(found.get("ate_reference"))]
+            rows.append([title, f"`{agent}`", *cells, lost(one)])
+    yield Table("Table 2: formation geometry and trajectories", header, rows, 2)
+    at = results.kinds(W.timed_flight().key, COST)
+    yield _costs("Table 1: time of a step, ten UAVs", at, PAPER_NANO_MS)
 
 
-def recorded(scenes: Sequence[Scene], flown: Flown) -> Table:
+def real(results: Results) -> Iterator[Table]:
     """Recordings: errors and what they are of dead reckoning's."""
-    header = ["recording", "agent", "RMSE (m)", "median", "90 %", "ATE", "FGE", "of dead reckoning"]
-    header += ["runs lost"]
-    lines = []
-    for scene in scenes:
-        there = flown.runs(scene.variant.key)
-        for agent, one in there.items():
-            figures = (one.whole, one.quantile(0.5), one.quantile(0.9))
-            means = (metrics.mean(one.ate), metrics.mean(one.fge))
-            ratio = of_alone(one, there.get(WORLD))
-            lines.append(
-                [
-                    scene.variant.title,
-                    f"`{agent}`",
-                    *(number(x, "{:.3f}") for x in (*figures, *means)),
-                    number(ratio),
-                    lost(one),
-                ]
-            )
-    return header, lines
+    places = {v.title: results.runs(v.key) for v in W.recordings()}
+    alone = {id(one): there.get(WORLD) for there in places.values() for one in there.values()}
+    columns = [
+        ("RMSE (m)", numbered(rmse_of_all, "{:.3f}")),
+        ("median", numbered(quantile(0.5), "{:.3f}")),
+        ("90 %", numbered(quantile(0.9), "{:.3f}")),
+        ("ATE", numbered(lambda one: metrics.mean(ate(one)), "{:.3f}")),
+        ("FGE", numbered(lambda one: metrics.mean(fge(one)), "{:.3f}")),
+        ("of dead reckoning", numbered(lambda one: ratio_to_alone(one, alone[id(one)]))),
+        ("runs lost", lost),
+    ]
+    yield by_agent("Every method", places, columns, where="recording")
 
 
-def costs(cost: Mapping[str, Cost], papers: Mapping[str, float]) -> Table:
+def _costs(
+    title: str, costs: Mapping[str, Cost], papers: Mapping[str, float], caption: str = ""
+) -> Table:
     """Time of a whole team's step, with the paper's on another machine."""
     own = plan.WHOLE
     header = ["agent", "median (ms)", "mean (ms)", "paper (ms)", f"times `{own}`", "memory (MiB)"]
-    unit = medians(cost, own)
-    lines = []
-    for agent, one in cost.items():
-        middle, paper = float(np.median(one.ms)), papers.get(agent)
-        held = (one.belief + one.working) / 2**20
-        lines.append(
-            [
-                f"`{agent}`",
-                f"{middle:.1f}",
-                f"{one.ms.mean():.1f}",
-                "" if paper is None else f"{paper:g}",
-                number(middle / unit),
-                f"{held:.1f}",
-            ]
-        )
-    return header, lines
+    unit, rows = median(costs, own), []
+    for agent, one in costs.items():
+        printed = f"{papers[agent]:g}" if agent in papers else ""
+        cells = [f"{one.median:.1f}", f"{one.ms.mean():.1f}", printed]
+        rows.append([f"`{agent}`", *cells, number(one.median / unit), f"{one.held / 2**20:.1f}"])
+    return Table(title, header, rows, 1, caption)
 
 
-def growth(cost: Mapping[int, Mapping[str, Cost]]) -> Table:
+def _growth(costs: Mapping[int, Mapping[str, Cost]]) -> Table:
     """Median time of a step by number of UAVs, and the exponent of its growth."""
-    header = ["agent", *(f"N = {n} (ms)" for n in cost), f"exponent from N = {GROWS_FROM} on"]
-    agents = dict.fromkeys(agent for there in cost.values() for agent in there)
-    lines = []
-    for agent in agents:
-        times = [medians(there, agent) for there in cost.values()]
-        grown = number(exponent(list(cost), times))
-        lines.append([f"`{agent}`", *(number(t, "{:.1f}") for t in times), grown])
-    return header, lines
+    costs = {n: there for n, there in costs.items() if there}
+    header = ["agent", *(f"N = {n} (ms)" for n in costs), f"exponent from N = {GROWS_FROM} on"]
+    rows = []
+    for agent in dict.fromkeys(agent for there in costs.values() for agent in there):
+        times = [median(there, agent) for there in costs.values()]
+        cells = [*(number(t, "{:.1f}") for t in times), number(exponent(list(costs), times))]
+        rows.append([f"`{agent}`", *cells])
+    return Table("Growth", header, rows)
 
 
-def medians(cost: Mapping[str, Cost], agent: str) -> float:
+def median(costs: Mapping[str, Cost], agent: str) -> float:
     """Median time of an agent's step in ms; NaN if it was not timed."""
-    return float(np.median(cost[agent].ms)) if agent in cost else float("nan")
+    return costs[agent].median if agent in costs else float("nan")
 
 
 def exponent(sizes: Sequence[int], times: Sequence[float]) -> float:
@@ -226,33 +256,3 @@ def exponent(sizes: Sequence[int], times: Sequence[float]) -> float:
     n, t = np.array(sizes, float), np.array(times)
     kept = np.isfinite(t) & (n >= GROWS_FROM)
     return float(np.polyfit(np.log(n[kept]), np.log(t[kept]), 1)[0]) if kept.sum() > 1 else np.nan
-
-
-def of_alone(one: Runs, alone: Runs | None) -> float:
-    """RMSE as a multiple of dead reckoning's in the same worlds."""
-    if alone is None:
-        return float("nan")
-    count = min(len(one.error), len(alone.error))
-    errors_ = (metrics.rmse(x.error[:count], x.scored[:count]) for x in (one, alone))
-    return next(errors_) / next(errors_)
-
-
-def nees(one: Runs) -> str:
-    """Mean NEES of the position; 3 in space, 2 in the plane, is consistent."""
-    return short(metrics.mean(one.one.nees[one.scored]))
-
-
-def lost(one: Runs) -> str:
-    """Runs that ended lost or not finite."""
-    return f"{int(one.results.diverged(one.agent).sum())} of {one.results.runs}"
-
-
-def number(value: float, form: str = "{:.2f}") -> str:
-    """A number, or a dash."""
-    return form.format(value) if np.isfinite(value) else DASH
-
-
-def spread(x: Difference) -> tuple[float, float]:
-    """How far an interval reaches below and above its mean; 0 where it is infinite."""
-    reach = (x.mean - x.low, x.high - x.mean)
-    return reach if np.isfinite(reach).all() else (0.0, 0.0)
