@@ -28,9 +28,9 @@ from coloc_env.world import World
 _SIZE, _RADIUS, _V_MAX = (160.0, 100.0), 40.0, 3.0
 _ANCHORS = ((0.0, 20.0), (0.0, 50.0), (0.0, 80.0))
 _SCOUTS = ((80.0, 25.0), (130.0, 75.0))  # m: where they roam
-_OWN = 0.05  # weight of the relays' own variance, beside the scouts'
-_AHEAD = 3.0  # s that the greedy policy looks ahead
-_TAIL, _FADES = 0.02, 20.0  # what a range out of reach is worth, that there is a way back, and m
+_OWN = 0.02  # weight of the relays' own variance, beside the scouts'
+_AHEAD = 2.0  # s that the greedy policy looks ahead
+_TAIL, _FADES = 0.02, 10.0  # what a range out of reach is worth, that there is a way back, and m
 _HEADINGS = torch.cat(
     (
         torch.zeros(1, 2),
@@ -59,8 +59,8 @@ def lattice(seen: Seen) -> Tensor:
 
 
 def greedy(seen: Seen) -> Tensor:
-    """Each takes the heading that will take most off the scouts' predicted variance in 4 s, all
-    others going on as they do."""
+    """Each takes the heading that will take most off the scouts' predicted variance in 2 s,
+    those before it having moved already."""
     task, n = seen.task, seen.task.n_agents
     b, total = seen.position.shape[:2]
     joint = seen.memory.joint.double()
@@ -72,7 +72,7 @@ def greedy(seen: Seen) -> Tensor:
     high = torch.tensor(_SIZE)
     ahead = torch.minimum(ahead.clamp_min(0.0), high)
     best = torch.zeros(b, n, 2)
-    for i in 2 * list(range(n)):
+    for i in range(n):
         moved = seen.position[:, i].unsqueeze(1) + _AHEAD * task.v_max * _HEADINGS
         moved = torch.minimum(moved.clamp_min(0.0), high)  # [B, 9, 2]
         place = ahead.unsqueeze(1).repeat(1, len(_HEADINGS), 1, 1)

@@ -56,7 +56,7 @@ def test_faces_agree_and_rows_are_their_seeds_over_a_whole_episode(name: str) ->
     task, seeds = short(name), torch.tensor([7, 8, 9])
     env = CoLocEnv(task.scenario, 3, seed=7, action=task)
     td = env.reset()
-    vec = CoLocVecEnv(task.scenario, 3, seed=7, action=short_again(task))
+    vec = CoLocVecEnv(task.scenario, 3, seed=7, action=task)
     flat = vec.reset()
     singles = [parallel(short(name), int(seed)) for seed in seeds]
     for k in range(SHORT):
@@ -77,10 +77,6 @@ def test_faces_agree_and_rows_are_their_seeds_over_a_whole_episode(name: str) ->
         if k + 1 == SHORT:
             assert td["truncated"].all()
             assert done.all()
-
-
-def short_again(task: Task) -> Task:
-    return task
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -176,9 +172,8 @@ def test_heuristics_do_better_than_chance_and_silence(name: str) -> None:
     for rule in ("random", "idle", task.best):
         steps = rollout(task, task.policies[rule], seeds)
         found[rule] = float(sum(step.reward.mean(-1) for step in steps).mean())
-    assert found[task.best] > 1.15 * max(found["random"], found["idle"]) - 1e-9 or found[
-        task.best
-    ] > 0.85 * max(found["random"], found["idle"])
+    chance = max(found["random"], found["idle"])
+    assert found[task.best] - chance > 0.25 * abs(chance)
 
 
 def test_wrong_actions_and_names_are_one_line() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from agents.kalman.ekf_joint import JointEkf
-from agents.models.measurements import make_measurements, nobody
+from agents.models.measurements import make_measurements, no_neighbours
 from agents.models.process import DisplacementProcess, make_process
 from coloc_env.bounds import posterior_bound
 from coloc_env.bounds.mixture import distance_information
@@ -76,7 +76,7 @@ def test_range_jacobian_and_variance_by_finite_differences() -> None:
     observation, process = world.reset(2), make_process(scenario.believed)
     x = torch.cat((world.truth.position, world.truth.velocity), -1)
     model = make_measurements(scenario.believed)[1]
-    neighbours = nobody(x[..., :2])
+    neighbours = no_neighbours(x[..., :2])
     block, step = model.linearize(process, x, observation, neighbours), 1e-5
     apart = x[..., None, :2] - torch.tensor(ANCHORS, dtype=torch.float64)
     expected = (0.1 + 0.05 * apart.norm(dim=-1)) ** 2
