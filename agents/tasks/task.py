@@ -20,6 +20,7 @@ from agents.registry import make
 from coloc_env.commands import Commands
 from coloc_env.envs.actions import ActionMode, Leaves
 from coloc_env.observation import Observation
+from coloc_env.options import require_known
 from coloc_env.scenario import DisplacementDriven, Scenario
 from coloc_env.sensors import AnchorRanging, Displacement, RangeNoise, Ranging, Sensor
 from coloc_env.sensors.base import Leaf
@@ -120,6 +121,11 @@ class Task(ActionMode):
             self._size = self.observe(memory, observation)[1]["observation"].shape[-1]
         mask = {} if self.choices is None else {"action_mask": Leaf(self.choices, 0.0, 1.0)}
         return {"observation": Leaf(self._size, -1.0, 1.0), **mask}
+
+    def policy(self, name: str) -> Policy:
+        """A heuristic by name; ValueError, with all there are, for an unknown one."""
+        require_known(f"policy of {self.name}", [name], self.policies)
+        return self.policies[name]
 
     def without_cooperation(self) -> "Task":
         """The same task for UAVs that cannot range each other."""

@@ -17,7 +17,6 @@ from torch import Tensor
 from agents.tasks import make_task
 from agents.tasks.runner import rollout
 from agents.tasks.task import Policy, Seen, Task
-from coloc_env.options import require_known
 
 FIRST_SEED = 10**9  # of the protocol's worlds; trainings use seeds below
 WORLDS = 256
@@ -91,8 +90,7 @@ def find_policy(task: Task, name: str) -> Policy:
     """A heuristic of the task by name, or somebody's own ``module:function``."""
     module, separator, attribute = name.partition(":")
     if not separator:
-        require_known(f"policy of {task.name}", [name], task.policies)
-        return task.policies[name]
+        return task.policy(name)
     try:
         policy: Policy = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:

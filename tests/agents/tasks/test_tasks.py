@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
@@ -15,6 +16,7 @@ import coloc_env
 from agents.tasks import TASKS, make_task
 from agents.tasks.gains import anchor_gains, range_gains
 from agents.tasks.runner import rollout
+from agents.tasks.single import SingleAgentTask
 from agents.tasks.task import Seen, Task
 from coloc_env import noise
 from coloc_env.envs.sb3 import CoLocVecEnv
@@ -120,6 +122,33 @@ def test_libraries_own_checks(name: str) -> None:
     vec = CoLocVecEnv(task.scenario, 2, seed=1, action=task)
     assert isinstance(vec, VecEnv)
     assert vec.observation_space.contains(vec.reset()[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_uav_among_good_ones_is_a_gymnasium_environment(name: str) -> None:
+    """Its episode is that of the PettingZoo face, where the others act by the same heuristic."""
+    task = short(name)
+    check_env(SingleAgentTask(short(name)), skip_render_check=True)
+    env, actions = SingleAgentTask(task), []
+    single = [env.reset(seed=4)[0]]
+    rule = task.policies[task.best]
+    rewards = []
+    for k in range(SHORT):
+        own = actions_of(task, torch.tensor([4]), k)[0, 0].numpy()
+        actions.append(own)
+        seen, reward, _, truncated, _ = env.step(own)
+        single.append(seen)
+        rewards.append(reward)
+    assert truncated
+
+    def played(seen: Seen) -> Tensor:
+        action = rule(seen).to(torch.float32).clone()
+        action[0, 0] = torch.as_tensor(actions[int(seen.memory.step[0, 0])], dtype=torch.float32)
+        return action
+
+    for k, step in enumerate(rollout(short(name), played, torch.tensor([4]), seed=4)):
+        assert float(step.reward[0, 0]) == rewards[k]
+        np.testing.assert_array_equal(step.seen.observation[0, 0].numpy(), single[k])
 
 
 @pytest.mark.parametrize("name", NAMES)
