@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,8 @@ from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box
 from coloc_env.options import Coordinate, Count, Group, PositiveCount, PositiveMetres, Share
 from coloc_env.sensors.base import in_slots, require, squared_norm
+
+Links = Literal["all", "chosen", "broadcast"]
 
 _BLOCK = 131072  # pairs of UAVs compared at once on a CPU: what stays in cache
 _SHADOWING = 4.0  # dB, standard deviation: IEEE 802.15.4a channel model, office without sight, 3.9
@@ -34,6 +36,12 @@ class Network:
     ``delay``: further steps a message needs beyond the one it always takes. ``max_neighbours``:
     teams of up to this size have one slot per UAV; in larger ones each UAV has this many slots, for
     the nearest UAVs in reach.
+
+    ``links``: who exchanges with whom in a step. ``all``: everybody in reach, both ways;
+    ``chosen``: each UAV may initiate one exchange with another UAV or an anchor, which fails if its
+    target initiates, or any other initiator is within ``interference`` m of the target (None: the
+    radius) or has the same target; ``broadcast``: each UAV speaks or listens, and who hears exactly
+    one ranges to it and gets its message.
     """
 
     radius: float | None = None
@@ -43,6 +51,8 @@ class Network:
     max_neighbours: int = 16
     failure: float = 0.0
     wall_loss: float = math.inf
+    links: Links = "all"
+    interference: float | None = None
 
     def __post_init__(self) -> None:
         require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
@@ -51,6 +61,10 @@ class Network:
         require(self.delay >= 0, self, "delay", "a number of steps ≥ 0")
         require(self.max_neighbours >= 1, self, "max_neighbours", "at least one slot")
         require(self.wall_loss >= 0, self, "wall_loss", "a loss in dB per metre ≥ 0")
+        kinds = get_args(Links)
+        require(self.links in kinds, self, "links", f"one of {', '.join(kinds)}")
+        near = self.interference is None or self.interference > 0
+        require(near, self, "interference", "a distance in m > 0")
         known = self.wall_loss == math.inf or self.radius is not None
         require(known, self, "wall_loss", "infinite, unless there is a radius")
 
@@ -152,7 +166,7 @@ class Network:
         loss = (_PER_DECIBEL * (self.wall_loss * inside + shadowing)).exp()
         return (inside == 0) | (apart * loss <= self.radius**2)
 
-    def links(
+    def delivered(
         self,
         keys: Int64[Tensor, "R K"],
         neighbours: Int64[Tensor, "#R #K N S"],

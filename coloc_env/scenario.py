@@ -25,6 +25,7 @@ class Prior:
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
     world; with ``kind="uniform"`` nothing of the position but that it lies in the arena, and with
     ``max_speed`` (m/s) nothing of the velocity but that each component lies within ± that.
+    ``target_std``: of the positions of targets, in m (None: as of UAVs).
     """
 
     position_std: float = 2.0
@@ -32,6 +33,7 @@ class Prior:
     attitude_std: float = 0.05
     kind: PriorKind = "gaussian"
     max_speed: float | None = None
+    target_std: float | None = None
 
     def __post_init__(self) -> None:
         kinds = get_args(PriorKind)
@@ -131,7 +133,12 @@ class InsDriven:
         require(0 <= self.bias_share < inf, self, "bias_share", "a number ≥ 0")
 
 
-Process = Inertial | Wheeled | ConstantVelocity | InsDriven
+@dataclass(frozen=True)
+class DisplacementDriven:
+    """Dead reckoning with the displacements that odometry measures."""
+
+
+Process = Inertial | Wheeled | ConstantVelocity | InsDriven | DisplacementDriven
 S = TypeVar("S", bound=Sensor)
 
 
@@ -139,7 +146,8 @@ S = TypeVar("S", bound=Sensor)
 class Believed:
     """All that localizers may know: geometry, time step, motion and noise models, never the truth.
 
-    Positions of landmarks and anchors come in the observation's map leaves.
+    Positions of landmarks and anchors come in the observation's map leaves. ``largest_command``:
+    where motion is steered, the largest component of a command (m/s or m/s²) that has any effect.
     """
 
     arena: Arena
@@ -148,6 +156,7 @@ class Believed:
     sensors: tuple[Sensor, ...]
     prior: Prior
     message_delay: int = 0
+    largest_command: float = 0.0
 
     def sensor(self, kind: type[S]) -> S | None:
         """The believed model of a sensor type, or None if the team has no such sensor."""
@@ -161,7 +170,9 @@ class Scenario:
     ``failure_rate``: probability that a UAV fails, at a uniformly drawn step, during an episode;
     ``failures``: ((uav, step), …) for failures at given steps. ``reward``: one of ``REWARDS``.
     ``anchor_uavs``: the first so many UAVs know where they are and are not scored. ``reference``:
-    what is to be reported beside the truth as if it were the truth (None: nothing).
+    what is to be reported beside the truth as if it were the truth (None: nothing). ``targets``:
+    the last so many UAVs are passive: others range to them, they range neither anchors nor each
+    other. ``strangers``: the first so many UAVs do not range each other.
     """
 
     name: str
@@ -179,6 +190,8 @@ class Scenario:
     reward: Reward = "error"
     anchor_uavs: int = 0
     reference: SatelliteReference | None = None
+    targets: int = 0
+    strangers: int = 0
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -190,11 +203,20 @@ class Scenario:
         require(known, self, "failures", "((uav index, step ≥ 1), …)")
         fewer = 0 <= self.anchor_uavs < self.arena.n_uavs
         require(fewer, self, "anchor_uavs", f"from 0 to fewer than the {self.arena.n_uavs} UAVs")
+        fewer = 0 <= self.targets < self.arena.n_uavs
+        require(fewer, self, "targets", f"from 0 to fewer than the {self.arena.n_uavs} UAVs")
+        free = self.network.links == "all" or self.network.dense(self.arena.n_uavs)
+        require(free, self.network, "links", "in teams with a slot for every UAV")
 
     @cached_property
     def layout(self) -> Layout:
         """What fixes the widths of observation leaves."""
         return Layout(self.arena, self.network.slots(self.arena.n_uavs))
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the world takes commands: its steps can then not be sensed ahead."""
+        return self.motion.steered or self.network.links != "all"
 
     @cached_property
     def believed(self) -> Believed:
@@ -206,6 +228,7 @@ class Scenario:
             sensors=self.believed_sensors,
             prior=self.believed_prior or self.prior,
             message_delay=self.network.delay,
+            largest_command=self.motion.largest,
         )
 
     @property

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.channel import Channel
 from coloc_env.geometry import rotate_by
 from coloc_env.motion import Carry, Kinematics
 from coloc_env.observation import action_width
@@ -122,10 +123,12 @@ def sense(
     placed: Sequence[dict[str, Tensor]],
     fails_at: Int64[Tensor, "R N"],
     past: Past | None,
+    calls: Int64[Tensor, "R N"] | None = None,
 ) -> tuple[Sensed, Carry, Past]:
     """Truth and measurements of R rows over ``count`` steps from each row's ``first`` on.
 
-    ``past`` is None at step 0, where the steps before are taken to be like the first.
+    ``past`` is None at step 0, where the steps before are taken to be like the first. ``calls`` are
+    the exchanges that were chosen for these steps (None: links are not chosen).
     """
     arena, network = scenario.arena, scenario.network
     steps = first.unsqueeze(-1) + torch.arange(count, device=keys.device)
@@ -154,6 +157,18 @@ def sense(
     alive = steps.unsqueeze(-1) < fails_at
     neighbours, reach = network.neighbours(motion.position, alive)
     reach = network.unbroken(step_keys, neighbours, reach, motion.position)
+    index = torch.arange(arena.n_uavs, device=keys.device)
+    for apart in (index >= arena.n_uavs - scenario.targets, index < scenario.strangers):
+        if scenario.targets or scenario.strangers:
+            reach = reach & ~(apart.unsqueeze(-1) & apart[neighbours])
+    to_anchors = None
+    if calls is not None:
+        near = network.interference or network.radius or float("inf")
+        channel = Channel(calls, motion.position[:, -1], near)
+        if network.links == "chosen":
+            reach, to_anchors = reach & channel.chosen().unsqueeze(1), channel.to_anchors
+        else:
+            reach = channel.broadcast(reach[:, -1]).unsqueeze(1)
     window = Window(
         layout=scenario.layout,
         rows=keys,
@@ -168,12 +183,14 @@ def sense(
             by: (back(by), noise.fold(keys.unsqueeze(-1), (steps - by).clamp_min(0)))
             for by in delays
         },
+        to_anchors=to_anchors,
+        targets=scenario.targets,
     )
     seen = window if moved.valid is None else _where_known(window, moved.valid)
     leaves: dict[str, Tensor] = {}
     for sensor, own in zip(scenario.sensors, placed, strict=True):
         leaves |= sensor.sample(seen if sensor.may_be_blind else window, own)
-    heard = network.links(step_keys, neighbours, reach)
+    heard = network.delivered(step_keys, neighbours, reach)
     leaves["links"] = heard.to(torch.float32)
     dense = network.dense(arena.n_uavs)
     scored = alive if moved.valid is None else alive & moved.valid
@@ -227,8 +244,10 @@ def draw_prior(
         position = (0.5 * (low + high)).expand_as(truth.position)
         position_std = ((high - low) / 12**0.5).expand_as(truth.position)
     else:
-        position = truth.position + prior.position_std * draws[..., :dim]
-        position_std = torch.full_like(position, prior.position_std)
+        position_std = torch.full_like(truth.position, prior.position_std)
+        if scenario.targets and prior.target_std is not None:
+            position_std[:, n - scenario.targets :] = prior.target_std
+        position = truth.position + position_std * draws[..., :dim]
     velocity = truth.velocity + prior.velocity_std * draws[..., dim : 2 * dim]
     if prior.max_speed is not None:
         velocity = torch.zeros_like(velocity)

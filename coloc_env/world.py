@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.commands import SILENT, Commands
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation, action_width, static_leaves
 from coloc_env.rewards import reward
@@ -67,6 +68,8 @@ class World:
         self.device = torch.device(device)
         ahead = _AGENT_STEPS // (batch_size * scenario.arena.n_uavs)
         self.window = window or max(1, min(ahead, _LONGEST, scenario.horizon + 1))
+        if scenario.commanded:
+            self.window = 1
         self._rows = max(1, _AGENT_STEPS // (self.window * scenario.arena.n_uavs))
         if self.device.type != "cpu":
             self._rows = batch_size
@@ -108,6 +111,8 @@ class World:
         self._placed = [sensor.place(keys, scenario.layout) for sensor in scenario.sensors]
         self._fails_at = self._failures(keys)
         n = scenario.arena.n_uavs
+        self.messages_sent = torch.zeros(len(keys), n, dtype=torch.int64, device=keys.device)
+        self._calls = torch.full_like(self.messages_sent, SILENT)
         self._static: dict[str, Tensor] = {}
         for sensor, placed in zip(scenario.sensors, self._placed, strict=True):
             for name, value in sensor.map_values(placed).items():
@@ -140,6 +145,8 @@ class World:
         self.seeds = merge(self.seeds, fresh.seeds)
         self._keys = merge(self._keys, fresh._keys)
         self._fails_at = merge(self._fails_at, fresh._fails_at)
+        self._calls = merge(self._calls, fresh._calls)
+        self.messages_sent = merge(self.messages_sent, fresh.messages_sent)
         self._carry = {k: merge(v, fresh._carry[k]) for k, v in self._carry.items()}
         self._static = {k: merge(v, fresh._static[k]) for k, v in self._static.items()}
         self._placed = [
@@ -166,6 +173,7 @@ class World:
                     placed=[{k: v[part] for k, v in p.items()} for p in self._placed],
                     fails_at=self._fails_at[part],
                     past=past.map(lambda x, part=part: x[part]) if past else None,
+                    calls=None if self.scenario.network.links == "all" else self._calls[part],
                 )
             )
         sensed, carries, pasts = zip(*blocks, strict=True)
@@ -181,14 +189,14 @@ class World:
 
     # ---------------------------------------------------------------- step
 
-    def step(self, estimates: Float32[Tensor, "B N A"]) -> Step:
+    def step(self, estimates: Float32[Tensor, "B N A"], commands: Commands | None = None) -> Step:
         """Score ``estimates`` of the current step (position m, velocity m/s, log-std, world frame),
-        then move every row one step on; rows past their horizon are to be reset by the caller.
-        The next step's measurements are ``observation()``.
+        then move every row one step on, as it is commanded where it takes commands; rows past their
+        horizon are to be reset by the caller. The next step's measurements are ``observation()``.
         """
         error, scored = self.score(estimates)
         value = reward(self.scenario.reward, estimates, self.now.target, error, scored)
-        self.advance(estimates)
+        self.advance(estimates, commands)
         now = self.now
         return Step(value, error, scored, terminated=now.failed, truncated=now.over)
 
@@ -206,15 +214,50 @@ class World:
             error = torch.where(now.scored, error, self._zero)
         return error, now.scored
 
-    def advance(self, estimates: Float32[Tensor, "B N A"]) -> None:
+    def advance(
+        self, estimates: Float32[Tensor, "B N A"], commands: Commands | None = None
+    ) -> None:
         """Send (copies of) the estimates as messages and move to the next step."""
+        self._command(commands or Commands())
         self._sent.append(estimates.clone(memory_format=torch.contiguous_format))
         self.cursor += 1
         self._since_reset += 1
         if self.cursor == self.sensed.count:
             self._sense(self.sensed.steps[:, -1] + 1, self._past)
 
+    def _command(self, commands: Commands) -> None:
+        """Take the commands of the step to come, and count what is sent in it."""
+        scenario = self.scenario
+        motion, calls = commands
+        if motion is not None:
+            if not scenario.motion.steered:
+                raise ValueError(f"{scenario.name}: its motion is not steered: no command fits")
+            if motion.shape != self._carry["command"].shape or not bool(motion.isfinite().all()):
+                shape = tuple(self._carry["command"].shape)
+                raise ValueError(
+                    f"{scenario.name}: commands of shape {tuple(motion.shape)} do not fit: finite "
+                    f"numbers of shape {shape} (worlds, UAVs, axes) are needed"
+                )
+            self._carry = {**self._carry, "command": motion.to(torch.float64, copy=True)}
+        if scenario.network.links == "all":
+            self.messages_sent = self.messages_sent + self.alive
+            return
+        calls = torch.full_like(self._calls, SILENT) if calls is None else calls
+        if calls.shape != self._calls.shape or calls.dtype != torch.int64:
+            raise ValueError(
+                f"{scenario.name}: calls of {calls.dtype} and shape {tuple(calls.shape)} do not "
+                f"fit: int64 of shape {tuple(self._calls.shape)} (worlds, UAVs) are needed"
+            )
+        self._calls = torch.where(self.alive, calls, SILENT)
+        self.messages_sent = self.messages_sent + (self._calls >= 0)
+
     # ---------------------------------------------------------------- views
+
+    @property
+    def bytes_sent(self) -> Int64[Tensor, "B N"]:
+        """Bytes that each UAV has sent since its reset: float32 numbers of an estimate a message.
+        (``messages_sent``: how many messages.)"""
+        return 4 * self._width * self.messages_sent
 
     @property
     def now(self) -> Frame:

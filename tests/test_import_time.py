@@ -54,7 +54,7 @@ def test_the_slow_are_not_loaded_before_they_are_used() -> None:
     assert "torch" not in loaded("import coloc_env, agents")
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "agents", "scenarios"])
+@pytest.mark.parametrize("words", ["--help", "--version", "agents", "scenarios", "tasks"])
 def test_lists_need_no_torch(words: str) -> None:
     code = (
         "from typer.testing import CliRunner\n"

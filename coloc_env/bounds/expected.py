@@ -9,7 +9,7 @@ from coloc_env.bounds.information import own_information, shared_information
 from coloc_env.geometry import rotate_by
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
-from coloc_env.sensors import Imu, Ins, Odometry, Sensor
+from coloc_env.sensors import Displacement, Imu, Ins, Odometry, Sensor
 
 # About single UAVs' states, and about the team's (None: no sensor has it).
 Information = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B m m"] | None]
@@ -34,7 +34,7 @@ def pose_information(
     sensors: list[Sensor], truth: Kinematics, seen: Observation
 ) -> tuple[Float64[Tensor, "B N D D"], Float64[Tensor, "B N D N D"] | None]:
     """``Σ Hᵀ R⁻¹ H`` at the truth: about single UAVs' poses, and about the team's (None: no sensor
-    has it). IMU, INS and odometry drive the process, and count there."""
+    has it). IMU, INS, odometry and displacements drive the process, and count there."""
     size = 6 if truth.position.shape[-1] == 3 else 3
     own = truth.position.new_zeros(*truth.position.shape[:2], size, size)
     shared = None
@@ -42,7 +42,7 @@ def pose_information(
         if sensor.between_uavs:
             joint = shared_information(sensor, truth, seen)
             shared = joint if shared is None else shared + joint
-        elif not isinstance(sensor, Imu | Ins | Odometry):
+        elif not isinstance(sensor, Displacement | Imu | Ins | Odometry):
             own += own_information(sensor, truth, seen)
     return own, shared
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from coloc_env.bounds.mixture import EXACT, range_information
+from coloc_env.bounds.mixture import EXACT, distance_information, range_information
 from coloc_env.geometry import cross_matrix, rotation_matrix
 from coloc_env.geometry.walls import depth
 from coloc_env.motion import Kinematics
@@ -95,6 +95,9 @@ def _anchor_ranging(
     each = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
     if sensor.blocked:
         each[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
+    if sensor.noise.per_metre:
+        points = _points(seen, "anchor_map", truth).unsqueeze(2)
+        each = distance_information(sensor.noise, (tags.unsqueeze(-2) - points).norm(dim=-1))
     weights = arrived * each
     return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
 
@@ -139,6 +142,9 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
     if sensor.walls:
         blocked = depth(points.unsqueeze(2), points.unsqueeze(1), sensor.walls) > 0
         each[blocked] = range_information(replace(sensor.noise, nlos=1.0))
+    if sensor.noise.per_metre:
+        apart = points.unsqueeze(2) - points.unsqueeze(1)
+        each = distance_information(sensor.noise, apart.norm(dim=-1))
     links = torch.maximum(links, links.transpose(1, 2)) * each
     along = _unit(points.unsqueeze(2) - points.unsqueeze(1))
     weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)

@@ -5,7 +5,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float64
 from numpy.typing import NDArray
+from torch import Tensor
 
 from coloc_env.sensors import RangeNoise
 
@@ -32,6 +34,18 @@ def range_information(noise: RangeNoise) -> float:
     supported = density > 1e-14 * density.max()  # below it the numbers are rounding errors
     step = 1 / density.sum()
     return float((slope[supported] ** 2 / density[supported]).sum() * step)
+
+
+def distance_information(
+    noise: RangeNoise, distance: Float64[Tensor, "*s"]
+) -> Float64[Tensor, "*s"]:
+    """Information in 1/m² about the distance d of ranges whose standard deviation σ = σ₀ + c d
+    grows with it: for N(d, σ²) it is (1 + 2 c²) / σ² (Kay 1993, eq. 3.31). NotImplementedError for
+    noise that is not Gaussian."""
+    if noise.nlos or noise.tail or noise.uniform or noise.impulse:
+        raise NotImplementedError("bounds: noise that grows with distance must be Gaussian")
+    std = (noise.std + noise.per_metre * distance).clamp_min(EXACT)
+    return (1 + 2 * noise.per_metre**2) / std**2
 
 
 def error_density(

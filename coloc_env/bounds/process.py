@@ -16,8 +16,16 @@ from torch import Tensor
 from coloc_env.bounds.mixture import EXACT
 from coloc_env.geometry import cross_matrix, rotation_between, rotation_matrix, unrotate
 from coloc_env.motion import Kinematics
-from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
-from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
+from coloc_env.scenario import (
+    ConstantVelocity,
+    DisplacementDriven,
+    Inertial,
+    InsDriven,
+    Prior,
+    Scenario,
+    Wheeled,
+)
+from coloc_env.sensors import GRAVITY, Displacement, Imu, Ins, Odometry, Sensor
 from coloc_env.sensors.base import RecordedSensor
 
 Jacobians = tuple[Float64[Tensor, "B N E E"], Float64[Tensor, "B N E E"]]
@@ -141,6 +149,25 @@ class InsErrors(ErrorModel):
 
 
 @dataclass(frozen=True)
+class DisplacementErrors(ErrorModel):
+    """δp, from displacements: p + z, z of variance s₀² + s₁² D over a true distance D."""
+
+    sensor: Displacement
+
+    def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
+        return position
+
+    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+        variance = self.sensor.variance((now.position - before.position).norm(dim=-1))
+        eye = torch.eye(self.dim).to(now.position)
+        q = variance[..., None, None] * eye
+        return eye.expand_as(q), q
+
+    def pose(self) -> Float64[Tensor, "D E"]:
+        return torch.eye(6 if self.dim == 3 else 3, self.dim, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
 class ConstantVelocityErrors(ErrorModel):
     """(δp, δv): ṗ = v, v̇ = −v/τ + white noise, integrated exactly over a step (with damping the
     integrated Ornstein–Uhlenbeck process), or noise that is held over the step. Attitude, where a
@@ -183,6 +210,8 @@ def error_model(scenario: Scenario) -> ErrorModel:
             return WheeledErrors(dim, dt, _true(scenario, Odometry))
         case InsDriven():
             return InsErrors(dim, dt, _true(scenario, Ins))
+        case DisplacementDriven():
+            return DisplacementErrors(dim, dt, _true(scenario, Displacement))
         case ConstantVelocity() as process:
             return ConstantVelocityErrors(dim, dt, process)
 

@@ -7,17 +7,19 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from coloc_env.observation import Observation, action_bounds, all_leaves, state_bounds
+from coloc_env.commands import Commands
+from coloc_env.observation import Observation, action_bounds, all_leaves, box, state_bounds
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors.base import Leaf
-from coloc_env.world import World
+from coloc_env.world import Step, World
 
 Leaves = dict[str, Float32[Tensor, "B N F"]]
 MAX_STATE_ERROR = 100.0  # m: larger errors are cut in the privileged state, whose bounds are finite
@@ -29,16 +31,27 @@ class ActionMode(ABC):
     A memory is a tensorclass of batch (B, N) that holds all there is from step to step (None if
     there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
     what the mode adds to each UAV's observation, ``features`` those that a policy should read,
-    ``meaning`` the words for an action in error messages.
+    ``meaning`` the words for an action in error messages. ``choices``: actions are one of so many
+    (None: numbers within ``bounds``). ``whole``: its leaf ``observation`` is all that agents see, a
+    flat vector within its bounds, with their ``action_mask`` where actions are choices.
+    ``rewards``: rewards are its own, of what is estimated after the step.
     """
 
-    name: ClassVar[str]
-    meaning: ClassVar[str]
+    name: str
+    choices: int | None = None
+    whole: bool = False
+    meaning: str
+    rewards: bool = False
     features: tuple[str, ...] = ()
 
     def __init__(self, believed: Believed) -> None:
         self.believed = believed
         self.dim = believed.arena.dim
+
+    @property
+    def n_agents(self) -> int:
+        """The first so many UAVs act; the others are part of the world."""
+        return self.believed.arena.n_uavs
 
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
@@ -48,7 +61,12 @@ class ActionMode(ABC):
     @property
     def width(self) -> int:
         """How many numbers one UAV's action has."""
-        return len(self.bounds[0])
+        return 1 if self.choices else len(self.bounds[0])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one UAV's action."""
+        return () if self.choices else (self.width,)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -75,25 +93,48 @@ class ActionMode(ABC):
         """The memory after an action, and the estimate that it stands for: position (m), velocity
         (m/s) and log standard deviation of the position (m), each per axis of the world frame."""
 
+    def commands(self, memory: Any, action: Float32[Tensor, "B n a"]) -> Commands:
+        """What an action commands the world to do in the step to come."""
+        return Commands()
+
+    def reward(self, memory: Any, world: World) -> tuple[Any, Float32[Tensor, "B n"]]:
+        """The reward of the step that led here, given the memory with this step's observation, and
+        the memory with what rewards are counted by."""
+        raise NotImplementedError
+
     def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
         """The position (m) that actions are relative to; None where they are not."""
         return None
 
 
 class Estimates(ActionMode):
-    """The estimate itself, as localizers give it. (Values beyond ``bounds`` are scored as well.)"""
+    """The estimate itself, as localizers give it (values beyond ``bounds`` are scored as well).
+
+    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame).
+    """
 
     name = "estimate"
     meaning = "[position, velocity, log-std]"
 
+    def __init__(self, believed: Believed) -> None:
+        super().__init__(believed)
+        self.largest = believed.largest_command
+        if self.largest:
+            self.meaning = "[position, velocity, log-std, command]"
+
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
-        return action_bounds(self.believed.arena)
+        low, high = action_bounds(self.believed.arena)
+        more = [self.largest] * self.dim if self.largest else []
+        return low + [-x for x in more], high + more
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
     ) -> tuple[None, Float32[Tensor, "B N A"]]:
-        return None, action
+        return None, action[..., : 3 * self.dim]
+
+    def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
+        return Commands(action[..., 3 * self.dim :] if self.largest else None)
 
 
 class ModeRunner:
@@ -106,7 +147,8 @@ class ModeRunner:
         self.mode, self.world = mode, world
         self.width = mode.width
         self._adds_nothing = not mode.leaves and type(mode).reset is ActionMode.reset
-        self._started = False
+        self._started = self._ahead = False
+        self._commands = Commands()
         self._memory: Any = None
         self._leaves: Leaves = {}
 
@@ -121,26 +163,45 @@ class ModeRunner:
             chosen = rows[:, None].expand(observation.batch_size)
             fresh = None if fresh is None else fresh.where(chosen, self._memory)
             leaves = {
-                name: torch.where(chosen.unsqueeze(-1), leaf, self._leaves[name])
+                name: torch.where(rows[:, None, None], leaf, self._leaves[name])
                 for name, leaf in leaves.items()
             }
-        self._memory, self._leaves, self._started = fresh, leaves, True
+        self._memory, self._leaves, self._started, self._ahead = fresh, leaves, True, False
         return self._copies()
 
     def observe(self) -> Leaves:
         """The leaves at the step that the worlds have moved to."""
         if self._adds_nothing:
             return {}
-        self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
+        if self._ahead:
+            self._ahead = False
+        else:
+            self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
         return self._copies()
 
     def _copies(self) -> Leaves:
         return {name: leaf.clone() for name, leaf in self._leaves.items()}
 
-    def estimate(self, action: Float32[Tensor, "B N a"]) -> Float32[Tensor, "B N A"]:
-        """The estimates that actions stand for."""
+    def estimate(self, action: Float32[Tensor, "B n a"]) -> Float32[Tensor, "B N A"]:
+        """The estimates that actions stand for; what they command waits for ``step``."""
         self._memory, estimates = self.mode.estimate(self._memory, action)
+        self._commands = self.mode.commands(self._memory, action)
         return estimates
+
+    def step(self, estimates: Float32[Tensor, "B N A"]) -> Step:
+        """Move the worlds on, estimates scored and commands obeyed; rewards are the mode's."""
+        step = self.world.step(estimates, self._commands)
+        if not self.mode.rewards:
+            return step
+        self.observe()
+        self._ahead = True
+        self._memory, reward = self.mode.reward(self._memory, self.world)
+        return step._replace(reward=reward)
+
+    @property
+    def memory(self) -> Any:
+        """The mode's memory at the step last observed."""
+        return self._memory
 
     def state(self) -> Float32[Tensor, "B S"]:
         """What a critic may know: the truth, and the error in m of what actions are relative to,
@@ -150,6 +211,13 @@ class ModeRunner:
             return truth
         error = (reference - self.world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
         return torch.cat((truth, error.flatten(-2)), -1)
+
+
+def action_space(mode: ActionMode) -> gym.spaces.Space[Any]:
+    """One UAV's actions."""
+    if mode.choices is not None:
+        return gym.spaces.Discrete(mode.choices)
+    return box(mode.bounds)
 
 
 def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
@@ -172,7 +240,7 @@ def make_mode(scenario: Scenario, action: str | ActionMode) -> ActionMode:
 
 def observed_leaves(scenario: Scenario, mode: ActionMode) -> dict[str, Leaf]:
     """Every leaf of an observation in this mode, in the order of the spaces."""
-    return all_leaves(scenario) | mode.leaves
+    return mode.leaves if mode.whole else all_leaves(scenario) | mode.leaves
 
 
 def chosen_leaves(
@@ -182,7 +250,7 @@ def chosen_leaves(
     all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
     not end together."""
     known = observed_leaves(scenario, mode)
-    names = tuple(wanted or mode.features or known)
+    names = tuple(wanted or (("observation",) if mode.whole else mode.features or known))
     for name in names:
         if name not in known:
             raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")
@@ -208,7 +276,9 @@ def checked_tensor(
 ) -> Float32[Tensor, "B N a"]:
     """Actions of several worlds as float32. ValueError, in one line that names UAV, world and what
     is needed, for another shape, complex numbers, and NaN or infinity."""
-    shape = (worlds, scenario.arena.n_uavs, mode.width)
+    shape: tuple[int, ...] = (worlds, mode.n_agents)
+    if mode.choices is None:
+        shape = (*shape, mode.width)
     if tuple(actions.shape) != shape:
         raise ValueError(
             f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
@@ -219,11 +289,19 @@ def checked_tensor(
     actions = actions.to(torch.float32)
     finite = actions.isfinite()
     if not bool(finite.all()):
-        row, uav, _ = (~finite).nonzero()[0].tolist()
+        row, uav = (~finite).nonzero()[0, :2].tolist()
         raise ValueError(
             f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; "
             f"{_needed(mode)}"
         )
+    if mode.choices is not None:
+        known = (actions >= 0) & (actions < mode.choices) & (actions == actions.round())
+        if not bool(known.all()):
+            row, uav = (~known).nonzero()[0].tolist()
+            raise ValueError(
+                f"{scenario.name}: the action of uav_{uav} in world {row} is none of the choices; "
+                f"{_needed(mode)}"
+            )
     return actions
 
 
@@ -233,9 +311,9 @@ def checked_arrays(
     """The agents' actions, one a row. ValueError, in one line that names the agent and what is
     needed, for one that is not numeric, complex, of another shape, or holds NaN or infinity."""
     rows = _array([actions[agent] for agent in agents])
-    if rows is not None and rows.shape == (len(agents), mode.width):
+    if rows is not None and rows.shape == (len(agents), *mode.shape):
         values = rows.astype(np.float32, copy=False)
-        if np.count_nonzero(np.isfinite(values)) == values.size:
+        if np.count_nonzero(np.isfinite(values)) == values.size and _chosen(mode, values):
             return values
     return np.stack([_checked_array(scenario, mode, actions[agent], agent) for agent in agents])
 
@@ -246,13 +324,22 @@ def _checked_array(
     values = _array(action)
     if values is None:
         wrong = "is not made of real numbers"
-    elif values.shape != (mode.width,):
+    elif values.shape != mode.shape:
         wrong = f"has shape {values.shape}"
     elif not np.isfinite(values.astype(np.float32)).all():
         wrong = "holds NaN or infinity"
+    elif not _chosen(mode, values):
+        wrong = f"is {values}, none of the choices"
     else:
         return values.astype(np.float32)
     raise ValueError(f"{scenario.name}: the action of {agent} {wrong}; {_needed(mode)}")
+
+
+def _chosen(mode: ActionMode, values: np.ndarray) -> bool:
+    """Whether actions are among the choices, where there are choices."""
+    if mode.choices is None:
+        return True
+    return bool(((values >= 0) & (values < mode.choices) & (values == np.round(values))).all())
 
 
 def _array(numbers: Any) -> np.ndarray | None:
@@ -265,4 +352,7 @@ def _array(numbers: Any) -> np.ndarray | None:
 
 
 def _needed(mode: ActionMode) -> str:
+    if mode.choices is not None:
+        last = mode.choices - 1
+        return f"0 to {last} is needed with action={mode.name}: {mode.meaning}"
     return f"({mode.width},) finite numbers are needed with action={mode.name}: {mode.meaning}"

@@ -56,6 +56,8 @@ class SingleUavEnv(gym.Env[np.ndarray, np.ndarray]):
         scenario = scenario_from(scenario, overrides)
         if uav not in scenario.agents:
             raise ValueError(f"there is no {uav!r} in the team: {', '.join(scenario.agents)}")
+        if scenario.commanded:
+            raise ValueError(f"{scenario.name}: steered motion or chosen links need a whole team")
         if others is None and scenario.arena.n_uavs > 1:
             raise ValueError(f"{scenario.name}: others=None is not allowed: a policy for the team")
         self.env = CoLocParallelEnv(scenario, render_mode)

@@ -15,12 +15,13 @@ from coloc_env.envs.actions import (
     ActionMode,
     Leaves,
     ModeRunner,
+    action_space,
     checked_arrays,
     make_mode,
     observed_leaves,
     privileged_bounds,
 )
-from coloc_env.observation import all_leaves, box, observation_space
+from coloc_env.observation import all_leaves, box, flat_box, observation_space
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
@@ -67,13 +68,16 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         fps = max(1, round(1 / scenario.arena.dt))
         self.metadata = {**self.metadata, "name": scenario.name, "render_fps": fps}
         self.world = World(scenario)
-        self.possible_agents = scenario.agents
+        self.mode = make_mode(scenario, action)
+        self.possible_agents = scenario.agents[: self.mode.n_agents]
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
-        self.mode = make_mode(scenario, action)
         self._runner = ModeRunner(self.mode, self.world)
-        space = observation_space(observed_leaves(scenario, self.mode))
-        actions = box(self.mode.bounds)
+        seen = observed_leaves(scenario, self.mode)
+        space: gym.spaces.Space[Any] = observation_space(seen)
+        if self.mode.whole:
+            space = flat_box({"observation": seen["observation"]})
+        actions = action_space(self.mode)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
         self.state_space = box(privileged_bounds(scenario, self.mode))
@@ -83,11 +87,11 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._window: _Window
         self._renderer = None if render_mode is None else Renderer(scenario)
 
-    def observation_space(self, agent: str) -> gym.spaces.Dict:
+    def observation_space(self, agent: str) -> gym.spaces.Space[Any]:
         """The same space object for every agent and call."""
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> gym.spaces.Box:
+    def action_space(self, agent: str) -> gym.spaces.Space[Any]:
         """The same space object for every agent and call."""
         return self.action_spaces[agent]
 
@@ -112,7 +116,8 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self._renderer is not None:
             self._renderer.reset()
         infos = {agent: tally.info(0.0, False) for agent, tally in self._tallies.items()}
-        return self._observe(self._runner.reset()), infos
+        leaves = self._runner.reset()
+        return self._observe(leaves), self._masked(infos, leaves)
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -135,10 +140,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if self._renderer is not None:
             self._renderer.record(world, estimates)
         scored = self._of(self._window.scored[world.cursor])
-        step = world.step(estimates)
-        observations = self._observe(self._runner.observe())
+        step = self._runner.step(estimates)
+        leaves = self._runner.observe()
+        observations = self._observe(leaves)
         errors, rewards = self._of(step.error.tolist()[0]), self._of(step.reward.tolist()[0])
         infos = {a: self._tallies[a].add(errors[a], scored[a]) for a in acting}
+        infos = self._masked(infos, leaves)
         over = self._window.over[world.cursor]
         terminated, truncated = dict.fromkeys(acting, False), dict.fromkeys(acting, over)
         if self._can_fail:
@@ -185,9 +192,16 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             raise ValueError(f"{self.scenario.name}: {what}; acting now: {', '.join(agents)}")
         stacked = checked_arrays(self.scenario, self.mode, actions, agents)
         if len(agents) < count:
-            acting, stacked = stacked, np.zeros((count, self._runner.width), np.float32)
+            acting, stacked = stacked, np.zeros((count, *self.mode.shape), np.float32)
             stacked[[self._index[a] for a in agents]] = acting
         return torch.from_numpy(stacked).unsqueeze(0)
+
+    def _masked(self, infos: dict[str, Any], leaves: Leaves) -> dict[str, Any]:
+        """Infos with ``action_mask`` [choices] int8, where actions are choices."""
+        if "action_mask" in leaves:
+            masks = self._of(list(leaves["action_mask"].numpy()[0].astype(np.int8)))
+            infos = {agent: {**info, "action_mask": masks[agent]} for agent, info in infos.items()}
+        return infos
 
     def _of(self, every: list[T]) -> dict[str, T]:
         """The acting agents' entries of a list of all."""
@@ -195,12 +209,14 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             return dict(zip(self.agents, every, strict=True))
         return {agent: every[self._index[agent]] for agent in self.agents}
 
-    def _observe(self, leaves: Leaves) -> dict[str, dict[str, np.ndarray]]:
+    def _observe(self, leaves: Leaves) -> dict[str, Any]:
         """Each agent's leaves, ``leaves`` of the action mode included: rows of copies that nobody
         else has."""
         world = self.world
         if world.sensed is not self._window.sensed:
             self._window = _Window(world)
+        if self.mode.whole:
+            return self._of(list(leaves["observation"].numpy()[0]))
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]
         static = [leaf[world.cursor] for leaf in self._window.static]

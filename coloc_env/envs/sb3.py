@@ -14,11 +14,12 @@ from torch import Tensor
 from coloc_env.envs.actions import (
     ActionMode,
     ModeRunner,
+    action_space,
     checked_tensor,
     chosen_leaves,
     make_mode,
 )
-from coloc_env.observation import box, flat_box
+from coloc_env.observation import flat_box
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
@@ -80,14 +81,14 @@ class CoLocVecEnv(VecEnv):
         self.runner = ModeRunner(self.mode, self.world)
         chosen = chosen_leaves(scenario, self.mode, leaves)
         self.leaves, self._wanted = tuple(chosen), leaves
-        self.worlds, self.n_uavs = num_worlds, scenario.arena.n_uavs
+        self.worlds, self.n_uavs = num_worlds, self.mode.n_agents
         self.render_mode_used = render_mode
         self._renderer = None if render_mode is None else Renderer(scenario)
         pairs = [(b, i) for b in range(num_worlds) for i in range(self.n_uavs)]
         self.sub_envs = [SubEnv(self, b, i) for b, i in pairs]
         given = random_seed() if seed is None else checked_seed(seed, scenario.name)
         self.first_seed = self._next_seed = given
-        super().__init__(len(self.sub_envs), flat_box(chosen), box(self.mode.bounds))
+        super().__init__(len(self.sub_envs), flat_box(chosen), action_space(self.mode))
 
     def with_action(self, action: str | ActionMode) -> "CoLocVecEnv":
         """The same environment, from its first episode on, in another action mode."""
@@ -119,19 +120,21 @@ class CoLocVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         self.started()
         rows = np.array(actions)
-        if rows.shape != (self.num_envs, self.runner.width) or rows.dtype.kind not in "fiub":
+        shape = (self.num_envs, *self.mode.shape)
+        if rows.shape != shape or rows.dtype.kind not in "fiub":
             raise ValueError(
-                f"{self.scenario.name}: real numbers of shape {(self.num_envs, self.runner.width)} "
+                f"{self.scenario.name}: real numbers of shape {shape} "
                 f"are needed, each row {self.mode.meaning}; got {rows.dtype} of shape {rows.shape}"
             )
-        each = torch.from_numpy(rows.astype(np.float32)).view(self.worlds, self.n_uavs, -1)
+        each = torch.from_numpy(rows.astype(np.float32))
+        each = each.view(self.worlds, self.n_uavs, *self.mode.shape)
         self._actions = checked_tensor(self.scenario, self.mode, each, self.worlds)
 
     def step_wait(self) -> VecEnvStepReturn:
         estimates = self.runner.estimate(self._actions)
         if self._renderer is not None:
             self._renderer.record(self.world, estimates[:1])
-        step = self.world.step(estimates)
+        step = self.runner.step(estimates)
         observation = self._flat(self.runner.observe())
         infos: list[dict[str, Any]] = [{} for _ in self.sub_envs]
         over = bool(step.truncated[0])  # worlds start and end together
@@ -179,6 +182,6 @@ class CoLocVecEnv(VecEnv):
 
     def _flat(self, leaves: dict[str, Float32[Tensor, "B N F"]]) -> Array:
         """The chosen leaves at the current step, a row per UAV."""
-        seen = self.world.observation().leaves
+        seen = {} if self.mode.whole else self.world.observation().leaves
         parts = [leaves[name] if name in leaves else seen[name] for name in self.leaves]
         return torch.cat(parts, -1).flatten(0, 1).numpy()

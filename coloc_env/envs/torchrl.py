@@ -63,21 +63,28 @@ class CoLocEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        b, n, device = self.batch_size[0], self.scenario.arena.n_uavs, self.device
-        leaves = {
+        b, n, device = self.batch_size[0], self.mode.n_agents, self.device
+        specs = {
             name: Bounded(leaf.low, leaf.high, (b, n, leaf.width), device, torch.float32)
             if leaf.high < float("inf")
             else Unbounded((b, n, leaf.width), device, torch.float32)
             for name, leaf in observed_leaves(self.scenario, self.mode).items()
         }
+        masked = specs.pop("action_mask", None) if self.mode.whole else None
+        leaves = specs["observation"] if self.mode.whole else Composite(specs, shape=(b, n))
         low, high = (
             torch.tensor(x, dtype=torch.float32, device=device)
             for x in privileged_bounds(self.scenario, self.mode)
         )
         self.observation_spec = Composite(
             uav=Composite(
-                observation=Composite(leaves, shape=(b, n)),
+                observation=leaves,
                 mask=Categorical(2, (b, n), device, dtype=torch.bool),
+                **(
+                    {}
+                    if masked is None
+                    else {"action_mask": Binary(masked.shape[-1], masked.shape, device, torch.bool)}
+                ),
                 shape=(b, n),
             ),
             state=Bounded(
@@ -85,9 +92,14 @@ class CoLocEnv(EnvBase):
             ),
             shape=(b,),
         )
-        low, high = (torch.tensor(x, dtype=torch.float32, device=device) for x in self.mode.bounds)
-        shape = (b, n, self._runner.width)
-        action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
+        action: Bounded | Categorical
+        if self.mode.choices is not None:
+            action = Categorical(self.mode.choices, (b, n), device, torch.int64)
+        else:
+            ends = (torch.tensor(x, dtype=torch.float32, device=device) for x in self.mode.bounds)
+            low, high = ends
+            shape = (b, n, self._runner.width)
+            action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
         self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
         reward = Unbounded((b, n, 1), device, torch.float32)
         self.reward_spec = Composite(uav=Composite(reward=reward, shape=(b, n)), shape=(b,))
@@ -119,7 +131,7 @@ class CoLocEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["uav", "action"]
         action = checked_tensor(self.scenario, self.mode, action, self.batch_size[0])
-        step = self.world.step(self._runner.estimate(action))
+        step = self._runner.step(self._runner.estimate(action))
         out = self._observe(self._runner.observe())
         out["uav"].set("reward", step.reward.unsqueeze(-1))
         return out
@@ -130,6 +142,12 @@ class CoLocEnv(EnvBase):
             self._sensed = self.world.sensed
             self._frames = self._window(self._sensed).unbind(1)
         out = self._frames[self.world.cursor]
+        if self.mode.whole:
+            out["uav"].set("observation", leaves["observation"])
+            if "action_mask" in leaves:
+                out["uav"].set("action_mask", leaves["action_mask"] > 0)
+            out.set("state", self._runner.state())
+            return out
         observation = out["uav", "observation"]
         messages, heard = self.world.messages()
         observation.set("messages", messages)
@@ -142,12 +160,17 @@ class CoLocEnv(EnvBase):
     def _window(self, sensed: Sensed) -> TensorDict:
         """A window of steps [B, K], copied once: building a TensorDict a step costs more. What is
         done to an observation in place reaches no other step, and not the world."""
-        shape = (*sensed.steps.shape, self.scenario.arena.n_uavs)
-        static = {
-            name: leaf.unsqueeze(1).expand(*shape, -1) for name, leaf in self.world.static.items()
-        }
-        observation = TensorDict({**sensed.leaves, **static}, shape, device=self.device)
-        uav = TensorDict({"observation": observation, "mask": sensed.alive}, shape, self.device)
+        n = self.mode.n_agents
+        shape = (*sensed.steps.shape, n)
+        entries: dict[str, Any] = {"mask": sensed.alive[:, :, :n]}
+        if not self.mode.whole:
+            static = {
+                name: leaf.unsqueeze(1).expand(*shape, -1)
+                for name, leaf in self.world.static.items()
+            }
+            seen = {**sensed.leaves, **static}
+            entries["observation"] = TensorDict(seen, shape, device=self.device)
+        uav = TensorDict(entries, shape, self.device)
         truncated = sensed.over.unsqueeze(-1)
         terminated = ~sensed.alive.any(-1, keepdim=True)
         return TensorDict(
@@ -175,7 +198,7 @@ class PerUavEnv(EnvBase):
 
     def __init__(self, env: CoLocEnv, leaves: Sequence[str] | None = None) -> None:
         chosen = chosen_leaves(env.scenario, env.mode, leaves)
-        self.worlds, self.n_uavs = env.batch_size[0], env.scenario.arena.n_uavs
+        self.worlds, self.n_uavs = env.batch_size[0], env.mode.n_agents
         rows = self.worlds * self.n_uavs
         super().__init__(device=env.device, batch_size=torch.Size([rows]))
         self.env, self.scenario, self.mode, self.leaves = env, env.scenario, env.mode, tuple(chosen)
@@ -187,8 +210,11 @@ class PerUavEnv(EnvBase):
             shape=(rows,),
         )
         action = env.full_action_spec["uav", "action"]
-        flat = action.space.low.flatten(0, 1), action.space.high.flatten(0, 1)
-        self.action_spec = type(action)(*flat, flat[0].shape, self.device, torch.float32)
+        if env.mode.choices is not None:
+            self.action_spec = Categorical(env.mode.choices, (rows,), self.device, torch.int64)
+        else:
+            flat = action.space.low.flatten(0, 1), action.space.high.flatten(0, 1)
+            self.action_spec = type(action)(*flat, flat[0].shape, self.device, torch.float32)
         self.reward_spec = Unbounded((rows, 1), self.device, torch.float32)
         flag = Binary(1, (rows, 1), self.device, torch.bool)
         self.done_spec = Composite(
@@ -219,7 +245,9 @@ class PerUavEnv(EnvBase):
     def _flat(self, entries: TensorDictBase) -> TensorDictBase:
         """A step's entries, a row per UAV."""
         seen = entries["uav", "observation"]
-        observation = torch.cat([seen[name] for name in self.leaves], -1)
+        observation = seen
+        if not self.mode.whole:
+            observation = torch.cat([seen[name] for name in self.leaves], -1)
         flags = ("done", "terminated", "truncated")
         return TensorDict(
             {

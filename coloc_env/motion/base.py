@@ -7,6 +7,7 @@ tensors with a leading row dimension, so that rows can be reset alone.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
@@ -53,7 +54,18 @@ class Arena:
 
 
 class Motion(ABC):
-    """Base of all motions: frozen dataclasses whose fields are the motion's settings."""
+    """Base of all motions: frozen dataclasses whose fields are the motion's settings.
+
+    A ``steered`` one takes the team's command for the step k → k + 1: its carry holds it under
+    ``command`` [R, N, d], of which no component beyond ±``largest`` has any effect.
+    """
+
+    steered: ClassVar[bool] = False
+
+    @property
+    def largest(self) -> float:
+        """The largest component of a command that has any effect; 0 where nothing is steered."""
+        return 0.0
 
     @abstractmethod
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:

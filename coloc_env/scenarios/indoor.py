@@ -1,8 +1,8 @@
 """``indoor-v0``: six UAVs circling in a room with landmarks and UWB (PF-NN paper, section 3.1)."""
 
-from coloc_env.motion import MOTIONS, Arena, KidnapOptions, MotionName
+from coloc_env.motion import MOTIONS, Arena, ControlOptions, KidnapOptions, MotionName
 from coloc_env.network import WalledNetworkOptions
-from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds
+from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds, PositiveSpeed
 from coloc_env.scenario import (
     ConstantVelocity,
     Inertial,
@@ -27,6 +27,7 @@ def indoor(
     dt: PositiveSeconds = 0.1,
     horizon: PositiveCount = 1000,
     motion: MotionName = "circle",
+    v_max: PositiveSpeed = 3.0,
     uwb: bool = True,
     team: TeamOptions = TeamOptions(),
     landmarks: LandmarkOptions = LandmarkOptions(),
@@ -35,12 +36,13 @@ def indoor(
     imu: SimulatedImuOptions = SimulatedImuOptions(),
     network: WalledNetworkOptions = WalledNetworkOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
+    control: ControlOptions = ControlOptions(),
     prior: PriorOptions = PriorOptions(),
 ) -> Scenario:
     """UAVs in a room, with an IMU, landmarks seen as body-frame vectors, and UWB between all UAVs.
 
-    ``room``: its sides; ``dt`` s and ``horizon`` steps; ``uwb=false`` leaves out the ranges between
-    UAVs.
+    ``room``: its sides; ``dt`` s and ``horizon`` steps; ``v_max``: the top speed where the team's
+    commands steer; ``uwb=false`` leaves out the ranges between UAVs.
     """
     if anchors.nlos_anchor is not None and not anchors.anchors:
         raise ValueError(f"nlos_anchor={anchors.nlos_anchor} is not allowed: there are no anchors")
@@ -64,7 +66,7 @@ def indoor(
         name="indoor-v0",
         arena=arena,
         horizon=horizon,
-        motion=kidnap.of(MOTIONS[motion], dt),
+        motion=control.of(kidnap.of(MOTIONS[motion], dt), v_max),
         sensors=tuple(true),
         network=network.network(),
         prior=prior.at_start(),

@@ -3,7 +3,7 @@ section 5)."""
 
 from typing import Literal
 
-from coloc_env.motion import Arena, Box
+from coloc_env.motion import Arena, Box, ControlOptions
 from coloc_env.network import NetworkOptions
 from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds, PositiveSpeed
 from coloc_env.scenario import InsDriven, PriorOptions, Scenario, TeamOptions
@@ -34,6 +34,7 @@ def swarm(
     ins: InsOptions = InsOptions(),
     network: NetworkOptions = NetworkOptions(comm_radius=5_000.0),
     prior: PriorOptions = PriorOptions(prior_std=50.0),
+    control: ControlOptions = ControlOptions(a_max=15.0),
 ) -> Scenario:
     """A swarm in a box of 10 × 10 × 5 km; once a second each UAV has its velocity by an INS and its
     distances to the others in reach.
@@ -49,7 +50,7 @@ def swarm(
         name="swarm-v0",
         arena=Arena(3, n_uavs, dt, (0.0, 0.0, 0.0), size),
         horizon=horizon,
-        motion=swarm_motion(motion, v_max, _boxes(layout, size), size),
+        motion=control.of(swarm_motion(motion, v_max, _boxes(layout, size), size), v_max),
         sensors=(*own, Ranging(ranges.true, latency=ranges.uwb_delay)),
         network=network.network(max_neighbours=n_uavs),
         prior=prior.at_start(),

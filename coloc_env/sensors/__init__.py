@@ -2,6 +2,7 @@
 
 from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
+from coloc_env.sensors.displacement import Displacement
 from coloc_env.sensors.errors.clock import Clock
 from coloc_env.sensors.errors.range_noise import NlosKind, RangeNoise, RangeOptions
 from coloc_env.sensors.height import Height
@@ -20,6 +21,7 @@ __all__ = [
     "AnchorRanging",
     "AnchorUavOptions",
     "Clock",
+    "Displacement",
     "Height",
     "Imu",
     "ImuOptions",

@@ -1,7 +1,7 @@
 """The seam every sensor sits on: one file per modality, no change to World, faces or localizers."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -43,7 +43,8 @@ class Window:
     ``motion`` and ``before`` are the true kinematics at each step and one step earlier (the same at
     step 0). ``rows`` are the rows' noise keys, ``keys`` those of (row, step). Slot ``s`` of UAV
     ``i`` holds UAV ``neighbours[…, i, s]``; ``reach``: whether its radio signal arrives,
-    message loss aside.
+    message loss aside. ``to_anchors``: whose exchanges with anchors at given places (m) succeed,
+    where UAVs choose them (None: everybody's). The last ``targets`` UAVs range no anchors.
     """
 
     layout: Layout
@@ -56,6 +57,14 @@ class Window:
     neighbours: Int64[Tensor, "#R #K N S"]
     reach: Bool[Tensor, "R K N S"]
     past: dict[int, tuple[Kinematics, Int64[Tensor, "R K"]]] = field(default_factory=dict)
+    to_anchors: Callable[[Float64[Tensor, "R A d"]], Bool[Tensor, "R N A"]] | None = None
+    targets: int = 0
+
+    @property
+    def is_target(self) -> Bool[Tensor, "N"]:
+        """Which UAVs are targets."""
+        n = self.layout.arena.n_uavs
+        return torch.arange(n, device=self.keys.device) >= n - self.targets
 
     def delayed(self, delay: int) -> tuple[Kinematics, Int64[Tensor, "R K"]]:
         """Kinematics and noise keys ``delay`` steps earlier: what a delayed sensor delivers now."""

@@ -189,6 +189,10 @@ class AnchorRanging(Sensor):
         obstructed = self.noise.obstructed(window, index, "anchor_ranging")
         ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked, obstructed)
         mask = window.alive[..., None, None].expand(ranges.shape)
+        if window.to_anchors is not None:
+            mask = mask & window.to_anchors(placed["anchors"])[:, None, :, None]
+        if window.targets:
+            mask = mask & ~window.is_target[:, None, None]
         if self.radius is not None:
             mask = mask & (distance <= self.radius)
         if lost is not None:

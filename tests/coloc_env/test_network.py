@@ -237,8 +237,8 @@ def test_loss_depends_on_the_pair_not_on_the_slot() -> None:
     network = Network(loss=0.5)
     reach = torch.ones(1, 1, 4, 4, dtype=torch.bool)
     index = torch.arange(4).expand(1, 1, 4, 4)
-    straight = network.links(keys, index, reach)
-    assert torch.equal(network.links(keys, index.flip(-1), reach).flip(-1), straight)
+    straight = network.delivered(keys, index, reach)
+    assert torch.equal(network.delivered(keys, index.flip(-1), reach).flip(-1), straight)
 
 
 def test_a_team_of_two_slots_is_dense_up_to_its_size() -> None:

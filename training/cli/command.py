@@ -15,6 +15,7 @@ from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
 from training.cli.render import render
 from training.cli.reproduce import reproduce
+from training.cli.score import score, tasks
 from training.cli.train import train
 
 
@@ -58,7 +59,17 @@ app = typer.Typer(
     coloc evaluate indoor-v0 --agents ekf,pf500 --runs 5 --out results/first
     """,
 )
-for _command in (evaluate, scenarios, agents, render, bench, train, reproduce):
+for _command in (
+    evaluate,
+    score,
+    scenarios,
+    agents,
+    tasks,
+    render,
+    bench,
+    train,
+    reproduce,
+):
     app.command()(_command)
 
 

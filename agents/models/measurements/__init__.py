@@ -7,7 +7,13 @@ from agents.models.measurements.base import Block, Measurement, Neighbours, no_n
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
-from coloc_env.scenario import Believed, ConstantVelocity, InsDriven, Wheeled
+from coloc_env.scenario import (
+    Believed,
+    ConstantVelocity,
+    DisplacementDriven,
+    InsDriven,
+    Wheeled,
+)
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
@@ -73,9 +79,12 @@ def make_measurements(believed: Believed) -> list[Measurement]:
     """
     for sensor in believed.sensors:
         name, process = type(sensor).__name__, believed.process
-        if isinstance(sensor, _BODY_FRAME) and isinstance(process, ConstantVelocity | InsDriven):
+        level = ConstantVelocity | InsDriven | DisplacementDriven
+        if isinstance(sensor, _BODY_FRAME) and isinstance(process, level):
             raise ValueError(f"{name} are in the body frame: the motion model has no attitude")
-        if isinstance(sensor, SlowFlight) and isinstance(process, Wheeled | InsDriven):
+        if isinstance(sensor, SlowFlight) and isinstance(
+            process, Wheeled | InsDriven | DisplacementDriven
+        ):
             kind = type(process).__name__
             raise ValueError(f"{name} is about velocity, which {kind} motion does not estimate")
     models = ((model_of(type(sensor)), sensor) for sensor in believed.sensors)

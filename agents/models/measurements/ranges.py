@@ -14,7 +14,7 @@ from agents.models.measurements.base import (
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
-from coloc_env.sensors import AnchorRanging, Ranging
+from coloc_env.sensors import AnchorRanging, RangeNoise, Ranging
 from coloc_env.sensors.ranging import Tags
 
 
@@ -24,8 +24,8 @@ class _Ranges(Measurement):
     leaf: str
     mask_leaf: str
 
-    def __init__(self, std: float, tags: Tags) -> None:
-        self.variance = noise_std(std) ** 2
+    def __init__(self, noise: RangeNoise, tags: Tags) -> None:
+        self.noise, self.variance = noise, noise_std(noise.std) ** 2
         self.tags = tags
 
     def read(
@@ -62,6 +62,13 @@ class _Ranges(Measurement):
             derivative = torch.stack((-turned[..., 1:], turned[..., :1]), -2)
         return position + turned, derivative, 0.0
 
+    def _variance(self, distance: Float[Tensor, "B N T P"]) -> Float[Tensor, "B N T*P 1"]:
+        """R of each range, at the distance that is expected."""
+        flat = distance.flatten(-2).unsqueeze(-1)
+        if not self.noise.per_metre:
+            return flat.new_tensor(self.variance).expand_as(flat)
+        return (noise_std(self.noise.std) + self.noise.per_metre * flat) ** 2
+
     def _block(
         self,
         process: Process,
@@ -87,7 +94,7 @@ class _Ranges(Measurement):
         block = Block(
             residual=residual,
             jacobian=jacobian,
-            variance=x.new_tensor(self.variance + spread).expand_as(residual),
+            variance=self._variance(distance) + spread if spread else self._variance(distance),
             mask=mask.flatten(-2),
         )
         return block, unit
@@ -106,7 +113,7 @@ class AnchorRanges(_Ranges):
         return self.read(observation)[0], observation["anchor_map"].unflatten(-1, (-1, d))
 
     def __init__(self, sensor: AnchorRanging) -> None:
-        super().__init__(sensor.noise.std, sensor.tags)
+        super().__init__(sensor.noise, sensor.tags)
         self.n_tags = sensor.n_tags
 
     def linearize(
@@ -140,7 +147,7 @@ class UavRanges(_Ranges):
         return self.read(observation)[0], neighbours.position
 
     def __init__(self, sensor: Ranging) -> None:
-        super().__init__(sensor.noise.std, sensor.tags)
+        super().__init__(sensor.noise, sensor.tags)
         self.n_tags, self.latency = sensor.n_tags, sensor.latency
         arms = torch.tensor(sensor.tags, dtype=torch.float64) if sensor.tags else None
         self.their_arms = 0.0 if arms is None else float((arms**2).sum(-1).mean()) / arms.shape[-1]

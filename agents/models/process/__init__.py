@@ -1,4 +1,4 @@
-"""What a team believes of its motion: one interface, four models, batched over anything.
+"""What a team believes of its motion: one interface, five models, batched over anything.
 
 A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the
 tangent space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position
@@ -10,13 +10,14 @@ import math
 from agents.models.process.base import Process
 from agents.models.process.constant_velocity import ConstantVelocityProcess
 from agents.models.process.inertial import InertialProcess
-from agents.models.process.reckoned import InsProcess, WheeledProcess
+from agents.models.process.reckoned import DisplacementProcess, InsProcess, WheeledProcess
 from coloc_env import scenario as believed_processes
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Imu, Ins, Odometry, Sensor
+from coloc_env.sensors import Displacement, Imu, Ins, Odometry, Sensor
 
 __all__ = [
     "ConstantVelocityProcess",
+    "DisplacementProcess",
     "InertialProcess",
     "InsProcess",
     "Process",
@@ -31,6 +32,7 @@ _INPUTS: dict[type, type[Sensor]] = {  # what drives a motion model
     believed_processes.Inertial: Imu,
     believed_processes.InsDriven: Ins,
     believed_processes.Wheeled: Odometry,
+    believed_processes.DisplacementDriven: Displacement,
 }
 
 
@@ -60,6 +62,11 @@ def _process(believed: Believed) -> Process:
         if ins is None:
             raise ValueError("the believed motion is driven by an INS, but the team has none")
         return InsProcess(arena.dim, arena.dt, ins, settings)
+    if isinstance(settings, believed_processes.DisplacementDriven):
+        displacement = believed.sensor(Displacement)
+        if displacement is None:
+            raise ValueError("the believed motion is driven by displacements, but none is measured")
+        return DisplacementProcess(arena.dim, arena.dt, displacement)
     if isinstance(settings, believed_processes.Wheeled):
         odometry = believed.sensor(Odometry)
         if odometry is None:

@@ -1,4 +1,4 @@
-"""Dead reckoning with a measured velocity, which is no estimated quantity: odometry and INS."""
+"""Dead reckoning with a measured velocity or displacement, which is no estimated quantity."""
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from agents.models.rotations import rotate, rotate_by, rotation_between
 from coloc_env import scenario as believed_processes
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation
-from coloc_env.sensors import Ins, Odometry
+from coloc_env.sensors import Displacement, Ins, Odometry
 
 
 class WheeledProcess(Process):
@@ -123,6 +123,65 @@ class InsProcess(Process):
     ) -> tuple[Float[Tensor, "*s d d"], Float[Tensor, "*s d d"]]:
         eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
         q = (self.std * dt[..., None, None]) ** 2 * eye
+        return eye.expand_as(q), q
+
+    def boxminus(
+        self, x: Float[Tensor, "*s 2d"], y: Float[Tensor, "*s 2d"]
+    ) -> Float[Tensor, "*s d"]:
+        return x[..., : self.dim] - y[..., : self.dim]
+
+    def _linear(self, delta: Float[Tensor, "*s d"]) -> Float[Tensor, "*s 2d"]:
+        return torch.cat((delta, torch.zeros_like(delta)), -1)
+
+
+class DisplacementProcess(Process):
+    """x = [p, v], u = the measured displacement: p' = p + u, v' = u / dt; the error is δp.
+
+    Q = (s₀² + s₁² D) I, D the distance that a displacement of u most likely came from.
+    """
+
+    def __init__(self, dim: int, dt: float, sensor: Displacement) -> None:
+        super().__init__(dim, dt)
+        self.sensor = sensor
+        self.state_size, self.error_size, self.noise_size = 2 * dim, dim, dim
+
+    def _initial(
+        self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s 2d"]
+    ) -> tuple[Float[Tensor, "*s 2d"], Float[Tensor, "*s d d"]]:
+        return mean[..., : self.state_size], torch.diag_embed(std[..., : self.dim] ** 2)
+
+    def inputs(self, observation: Observation) -> Float[Tensor, "B N d"]:
+        return observation["displacement"].double()
+
+    def _variance(self, u: Float[Tensor, "*s d"], dt: Float[Tensor, "*s"]) -> Float[Tensor, "*s 1"]:
+        variance = self.sensor.variance(self.sensor.distance(u))
+        return (variance * (dt / self.dt) ** 2).unsqueeze(-1)
+
+    def propagate(
+        self,
+        x: Float[Tensor, "*s 2d"],
+        u: Float[Tensor, "*s d"],
+        dt: Float[Tensor, "*s"],
+        noise: Float[Tensor, "*s d"] | None = None,
+    ) -> Float[Tensor, "*s 2d"]:
+        share = dt.unsqueeze(-1) / self.dt
+        moved = u * share
+        if noise is not None:
+            moved = moved + self._variance(u, dt).sqrt() * noise
+        velocity = torch.where(share > 0, moved / dt.unsqueeze(-1), x[..., self.dim :])
+        return concat((x[..., : self.dim] + moved, velocity))
+
+    def retreat(
+        self, x: Float[Tensor, "*s 2d"], u: Float[Tensor, "*s d"], dt: Float[Tensor, "*s"]
+    ) -> Float[Tensor, "*s 2d"]:
+        share = dt.unsqueeze(-1) / self.dt
+        return concat((x[..., : self.dim] - u * share, x[..., self.dim :]))
+
+    def linearize(
+        self, x: Float[Tensor, "*s 2d"], u: Float[Tensor, "*s d"], dt: Float[Tensor, "*s"]
+    ) -> tuple[Float[Tensor, "*s d d"], Float[Tensor, "*s d d"]]:
+        eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
+        q = self._variance(u, dt).unsqueeze(-1) * eye
         return eye.expand_as(q), q
 
     def boxminus(

@@ -29,7 +29,8 @@ class RangeNoise:
       correlation falls by e in that time (None: every step for itself); the size of an exponential
       bias is drawn for every step in any case;
     - ``impulse``: probability of a gross error, uniform within ±``impulse_size`` m;
-    - ``dropout``: probability that no range arrives.
+    - ``dropout``: probability that no range arrives;
+    - ``per_metre``: what each metre of distance adds to ``std``, in m.
     """
 
     std: float = 0.2
@@ -43,11 +44,12 @@ class RangeNoise:
     impulse_size: float = 10.0
     dropout: float = 0.0
     nlos_time: float | None = None
+    per_metre: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("nlos", "tail", "impulse", "dropout"):
             require(0 <= getattr(self, name) <= 1, self, name, "a probability in [0, 1]")
-        for name in ("std", "nlos_bias", "tail_std", "uniform", "impulse_size"):
+        for name in ("std", "nlos_bias", "tail_std", "uniform", "impulse_size", "per_metre"):
             require(0 <= getattr(self, name) < math.inf, self, name, "a size in m ≥ 0")
         kinds = get_args(NlosKind)
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
@@ -85,7 +87,10 @@ class RangeNoise:
         error = noise.normal(keys, stream, 1)[..., 0]
         if self.tail:
             wide, narrow = error.new_tensor((self.tail_std, self.std))
-            error = error * torch.where(chance(self.tail, "tail"), wide, narrow)
+            spread = narrow + self.per_metre * distance if self.per_metre else narrow
+            error = error * torch.where(chance(self.tail, "tail"), wide, spread)
+        elif self.per_metre:
+            error = error * (self.std + self.per_metre * distance)
         else:
             error = error * self.std
         if self.uniform:
@@ -109,17 +114,19 @@ class RangeNoise:
 
 @dataclass(frozen=True)
 class RangeOptions(Group):
-    """Ranges are N(d, ``uwb_std``²); a share ``nlos`` of them has a bias of ``nlos_bias`` m
-    (``nlos_kind``: on average, or exactly), in each step by chance or over ``nlos_time`` s; a share
-    ``uwb_tail`` has noise of ``uwb_tail_std`` m instead; ``uwb_uniform`` m is the half width of a
-    uniform error; a share ``uwb_impulse`` is off by up to ``uwb_impulse_size`` m, and a share
-    ``uwb_dropout`` is missing. The team believes the Gaussian part alone, with
-    ``believed_uwb_std`` m (none: the true one, where the scenario does not say otherwise).
+    """Ranges are N(d, σ²), σ ``uwb_std`` m and ``uwb_std_per_metre`` m more for each metre; a share
+    ``nlos`` of them has a bias of ``nlos_bias`` m (``nlos_kind``: on average, or exactly), in each
+    step by chance or over ``nlos_time`` s; a share ``uwb_tail`` has noise of ``uwb_tail_std`` m
+    instead; ``uwb_uniform`` m is the half width of a uniform error; a share ``uwb_impulse`` is off
+    by up to ``uwb_impulse_size`` m, and a share ``uwb_dropout`` is missing. The team believes the
+    Gaussian part alone, with ``believed_uwb_std`` m for ``uwb_std`` (none: the true one, where the
+    scenario does not say otherwise).
     """
 
     title: ClassVar[str] = "UWB ranges"
 
     uwb_std: Metres = 0.2
+    uwb_std_per_metre: Metres = 0.0
     nlos: Share = 0.0
     nlos_bias: Metres = 1.0
     nlos_kind: NlosKind = "exponential"
@@ -137,6 +144,7 @@ class RangeOptions(Group):
         """The noise that ranges have."""
         return RangeNoise(
             std=self.uwb_std,
+            per_metre=self.uwb_std_per_metre,
             nlos=self.nlos,
             nlos_bias=self.nlos_bias,
             nlos_kind=self.nlos_kind,
@@ -152,4 +160,5 @@ class RangeOptions(Group):
     @property
     def believed(self) -> RangeNoise:
         """The noise that the team believes in."""
-        return RangeNoise(self.uwb_std if self.believed_uwb_std is None else self.believed_uwb_std)
+        std = self.uwb_std if self.believed_uwb_std is None else self.believed_uwb_std
+        return RangeNoise(std, per_metre=self.uwb_std_per_metre)

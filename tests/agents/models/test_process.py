@@ -13,6 +13,7 @@ from torch import Tensor
 
 from agents.models.process import (
     ConstantVelocityProcess,
+    DisplacementProcess,
     InertialProcess,
     InsProcess,
     Process,
@@ -24,7 +25,7 @@ from coloc_env.motion import Aggressive, Arena, Kinematics, RandomVelocity
 from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
-from coloc_env.sensors import GRAVITY, Imu, Ins, Odometry, Sensor
+from coloc_env.sensors import GRAVITY, Displacement, Imu, Ins, Odometry, Sensor
 from coloc_env.world import World
 
 DT = 0.1
@@ -37,6 +38,8 @@ PROCESSES: dict[str, Callable[[], Process]] = {
     "wheeled": lambda: WheeledProcess(DT, ODOMETRY),
     "ins": lambda: InsProcess(3, DT, Ins(0.3, 0.2), InsDriven(1.5)),
     "ins, plane": lambda: InsProcess(2, DT, Ins(0.3), InsDriven()),
+    "displacement": lambda: DisplacementProcess(3, DT, Displacement(0.1, 0.3)),
+    "displacement, plane": lambda: DisplacementProcess(2, DT, Displacement(0.2, 0.1)),
     "velocity": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7)),
     "plane": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7)),
     "damped": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7, damping=0.4)),
@@ -68,7 +71,7 @@ def states(process: Process, count: int = 50, seed: int = 0) -> Tensor:
 def inputs(process: Process, count: int = 50, seed: int = 1) -> Tensor:
     """[1, count, U]: hard manoeuvres, with gravity where it is felt."""
     width = {4: 6, 1: 3, 0: 0}[process.attitude_size]
-    if isinstance(process, InsProcess):
+    if isinstance(process, InsProcess | DisplacementProcess):
         width = process.dim
     u = normal(1, count, width, seed=seed)
     if width == 6:

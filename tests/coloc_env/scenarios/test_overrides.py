@@ -11,6 +11,7 @@ from coloc_env.world import World
 
 RANGES: dict[str, Any] = {
     "uwb_std": 0.7,
+    "uwb_std_per_metre": 0.05,
     "believed_uwb_std": 0.9,
     "nlos": 0.5,
     "nlos_bias": 40.0,
@@ -41,6 +42,7 @@ NETWORK: dict[str, Any] = {
     "message_delay": 1,
 }
 TEAM: dict[str, Any] = {"n_uavs": 3, "failure_rate": 1.0, "reward": "squared"}
+CONTROL: dict[str, Any] = {"control": "velocity", "a_max": 2.0}
 KIDNAPPING: dict[str, Any] = {"kidnap_at": 0.2, "kidnapped": (0,)}
 STEIN: dict[str, Any] = {
     "horizon": 17,
@@ -78,6 +80,8 @@ CHANGED: dict[str, dict[str, Any]] = {
         **DELAYED,
         **NETWORK,
         **KIDNAPPING,
+        **CONTROL,
+        "v_max": 2.0,
         **PRIOR,
         "comm_radius": 3.0,
     },
@@ -105,6 +109,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         **DELAYED,
         **INS,
         **NETWORK,
+        **CONTROL,
         **PRIOR,
         "n_uavs": 7,
         "nlos_kind": "exponential",
@@ -141,19 +146,24 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
     "uwb_impulse_size": {"uwb_impulse": 0.5},
 }
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
+STEERED: dict[str, dict[str, Any]] = {
+    "a_max": {"control": "acceleration"},
+}
 UNIFORM: dict[str, dict[str, Any]] = {"max_speed": {"prior": "uniform"}}
 WITH: dict[str, dict[str, dict[str, Any]]] = {
     "indoor-v0": {
         **RANGES_WITH,
         **FAILING,
         **UNIFORM,
+        **STEERED,
+        "v_max": {"control": "velocity"},
         "nlos_anchor": {"anchors": 2},
         "kidnapped": {"kidnap_at": 0.2},
         "accel_bias": {"imu_bias": True},
         "gyro_bias": {"imu_bias": True},
     },
     "wsn-v0": {**RANGES_WITH, **FAILING, "kidnapped": {"kidnap_at": 0.2, "n_uavs": 2}},
-    "swarm-v0": {**RANGES_WITH, **FAILING, **UNIFORM},
+    "swarm-v0": {**RANGES_WITH, **FAILING, **UNIFORM, **STEERED},
     "campus-v0": {
         **RANGES_WITH,
         **FAILING,

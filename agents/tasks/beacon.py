@@ -1,0 +1,114 @@
+"""``beacon-v0``: when to speak, so that those who listen can tell where they are."""
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
+
+from agents.tasks.gains import intersection_gains, log_gain
+from agents.tasks.schedule import _rank
+from agents.tasks.task import (
+    MOST_ERROR,
+    Seen,
+    Task,
+    TaskMemory,
+    idle,
+    own_sigma,
+    random_policy,
+    sensors,
+    task_scenario,
+)
+from coloc_env.commands import SILENT, Commands
+from coloc_env.motion import Arena, Roam
+from coloc_env.network import Network
+from coloc_env.options import PositiveCount
+from coloc_env.scenario import Prior
+from coloc_env.world import World
+
+_SIDE, _RADIUS, _ANCHOR_RADIUS = 120.0, 50.0, 20.0
+_ANCHORS = ((20.0, 45.0), (100.0, 75.0))
+
+
+def slots(seen: Seen) -> Tensor:
+    """UAVs in turns."""
+    n = seen.task.n_agents
+    return (torch.arange(n) == (seen.memory.step[:, :1] % n)).long()
+
+
+def local(seen: Seen) -> Tensor:
+    """Who would give the team more, alone, than everybody within two hops speaks."""
+    gain = seen.memory.more["gain"]
+    apart = (seen.position.unsqueeze(2) - seen.position.unsqueeze(1)).norm(dim=-1)
+    most = torch.where(apart <= 2 * _RADIUS, gain.unsqueeze(1), -1.0).amax(-1)
+    return ((gain >= most) & (gain > 0)).long()
+
+
+class Beacon(Task):
+    """Ten UAVs on waypoints, two anchors that only the near can range to. Each speaks or listens;
+    who hears exactly one ranges to it and fuses its estimate, by covariance intersection.
+
+    Reward: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise, m/√m.
+    A local rule does as well as a planner here: a sanity check more than a challenge.
+    """
+
+    policies: ClassVar = {"random": random_policy, "idle": idle, "slots": slots, "local": local}
+    best = "local"
+    team_reward = False
+    choices = 2
+    meaning = "0 to listen, 1 to speak"
+
+    def __init__(
+        self,
+        *,
+        n_uavs: PositiveCount = 10,
+        horizon: PositiveCount = 100,
+        drift: float = 0.3,
+        estimator: str = "ekf:fusion=ci:iterations=1",
+    ) -> None:
+        scenario = task_scenario(
+            "beacon-v0",
+            sensors(_ANCHORS, 0.05, drift, _ANCHOR_RADIUS),
+            arena=Arena(2, n_uavs, 1.0, (0.0, 0.0), (_SIDE, _SIDE)),
+            horizon=horizon,
+            motion=Roam(2.0),
+            network=Network(radius=_RADIUS, links="broadcast", max_neighbours=max(16, n_uavs)),
+            prior=Prior(2.0),
+        )
+        super().__init__(scenario, n_uavs, estimator, _RADIUS, 2.0)
+
+    def commands(self, memory: TaskMemory, action: Float32[Tensor, "B n"]) -> Commands:
+        return Commands(calls=torch.where(action > 0, 0, SILENT))
+
+    def estimate(
+        self, memory: TaskMemory, action: Float32[Tensor, "B n"]
+    ) -> tuple[TaskMemory, Float32[Tensor, "B N A"]]:
+        memory.more["called"] = action.to(torch.float32)
+        return memory, memory.action
+
+    def start(self, blank: Float32[Tensor, "B N"]) -> dict[str, Tensor]:
+        return {"called": blank.clone(), "gain": blank.clone()}
+
+    def keep(self, memory: TaskMemory) -> TaskMemory:
+        """What all who are in reach would gain, in m², if a UAV alone spoke."""
+        p = memory.position
+        own = memory.joint.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+        near = (p.unsqueeze(2) - p.unsqueeze(1)).norm(dim=-1) <= self.radius
+        near = near & ~torch.eye(p.shape[1], dtype=torch.bool)
+        memory.more["gain"] = (intersection_gains(p, own) * near).sum(1)
+        return memory
+
+    def allowed(self, memory: TaskMemory) -> Bool[Tensor, "B n C"]:
+        return torch.ones(*memory.position.shape[:2], 2, dtype=torch.bool)
+
+    def extras(self, memory: TaskMemory) -> list[Float32[Tensor, "B n F"]]:
+        """Gain if it alone spoke, ranks of σ and gain, what it did and heard, whose turn it is."""
+        n, gain = self.n_agents, memory.more["gain"]
+        heard = memory.seen[:, :, :n].any(-1).to(gain.dtype)
+        turn = ((memory.step - torch.arange(n)) % n == 0).to(gain.dtype)
+        flags = (2 * memory.more["called"] - 1, 2 * heard - 1, 2 * turn - 1)
+        ranks = (_rank(own_sigma(memory.joint)), _rank(gain))
+        return [torch.stack((log_gain(gain), *ranks, *flags), -1)]
+
+    def reward(self, memory: TaskMemory, world: World) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
+        return memory, -self.error(memory, world) / MOST_ERROR

@@ -1,0 +1,39 @@
+"""Tasks by name, and building one with its options."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from coloc_env import options
+from coloc_env.registry import Registry
+
+if TYPE_CHECKING:
+    from agents.tasks.task import Task
+
+TASKS = Registry(
+    "task",
+    "coloc.tasks",
+    {
+        "beacon-v0": "agents.tasks.beacon:Beacon",
+        "convoy-v0": "agents.tasks.convoy:Convoy",
+        "relay-v0": "agents.tasks.relay:Relay",
+        "schedule-v0": "agents.tasks.schedule:Schedule",
+        "survey-v0": "agents.tasks.survey:Survey",
+        "track-v0": "agents.tasks.track:Track",
+    },
+)
+
+
+def make_task(name: str, **chosen: Any) -> Task:
+    """Build a task; ``name`` may carry options as on the command line (``track-v0:drift=0.1``).
+
+    Raises ValueError, in one line that names what is allowed, for an unknown task or option.
+    """
+    name, *texts = name.split(":")
+    factory = TASKS.require(name)
+    known = options.of(factory)
+    for text in texts:
+        key, value = options.parse(name, text, known)
+        chosen[key] = value
+    made: Task = factory(**options.checked(name, chosen, known))
+    return made

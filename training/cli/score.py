@@ -1,0 +1,84 @@
+"""``coloc tasks`` and ``coloc score``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.cli.options import Threads
+from training.cli.terminal import explain, progress, show
+
+
+def tasks(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="[TASK]", help="Show this task's options; none: list all."),
+    ] = None,
+) -> None:
+    """List the tasks in which decisions matter, or one task's options and heuristics.
+
+    **Examples**
+
+    coloc tasks
+
+    coloc tasks survey-v0
+    """
+    from agents.tasks import TASKS
+
+    if name is None:
+        show(["task", ""], [[key, TASKS.summary(key)] for key in TASKS])
+        typer.echo("coloc tasks TASK lists its options and its heuristics.")
+        return
+    explain(name, TASKS, "option")
+    policies = getattr(TASKS[name], "policies", {})
+    rows = [[key, " ".join((rule.__doc__ or "").split())] for key, rule in policies.items()]
+    typer.echo("")
+    show(["heuristic", ""], rows)
+
+
+def score(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="See **coloc tasks**.")],
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="A heuristic of the task, or **module:function** of your own."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the figures here, as JSON.")
+    ] = None,
+    worlds: Annotated[int, typer.Option(help="Worlds; fewer are no score to report.")] = 256,
+    threads: Threads = 1,
+) -> None:
+    """Score a policy on a task's fixed worlds, which no training uses.
+
+    **Examples**
+
+    coloc score survey-v0 --policy frontier
+
+    coloc score schedule-v0 --policy my_module:my_policy --out score.json
+    """
+    from training.threads import use_threads
+
+    use_threads(threads)
+    if worlds < 4:
+        raise ValueError(f"--worlds {worlds} is not allowed: at least 4")
+    import json
+
+    from training.evaluation.score import score as measure
+
+    with progress() as advance:
+        found = measure(task, policy, worlds, advance)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    low, high = found["interval_95"]
+    lines = [
+        ["return", f"{found['return']:.2f} ± {found['standard_error']:.2f}"],
+        ["interquartile mean", f"{found['interquartile_mean']:.2f} [{low:.2f}, {high:.2f}]"],
+        ["share of random … best known", f"{found['share_of_span']:.2f}"],
+        ["error, m", f"{found['error']:.2f}"],
+        ["others at random cost uav_0", f"{found['interaction']['cost']:.2f}"],
+        ["ranges between UAVs are worth", f"{found['cooperation']['worth']:.2f}"],
+    ]
+    show([f"{task}, {policy}", ""], lines)
