@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from agents.tasks.gains import intersection_gains, log_gain
-from agents.tasks.schedule import _rank
+from agents.tasks.gains import intersection_gains, log_gain, rank
 from agents.tasks.task import (
     MOST_ERROR,
     Seen,
@@ -107,7 +106,7 @@ class Beacon(Task):
         heard = memory.seen[:, :, :n].any(-1).to(gain.dtype)
         turn = ((memory.step - torch.arange(n)) % n == 0).to(gain.dtype)
         flags = (2 * memory.more["called"] - 1, 2 * heard - 1, 2 * turn - 1)
-        ranks = (_rank(own_sigma(memory.joint)), _rank(gain))
+        ranks = (rank(own_sigma(memory.joint)), rank(gain))
         return [torch.stack((log_gain(gain), *ranks, *flags), -1)]
 
     def reward(self, memory: TaskMemory, world: World) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:

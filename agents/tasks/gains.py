@@ -77,3 +77,11 @@ def intersection_gains(
 def log_gain(gain: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
     """Gains of 10⁻³ … 10 m² as −1 … 1."""
     return (gain.clamp_min(1e-9).log10() + 1.0) / 2.0
+
+
+def rank(value: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
+    """−1 for the smallest of the team, 1 for the largest."""
+    n = value.shape[-1]
+    return (
+        2 * (value.unsqueeze(-1) > value.unsqueeze(-2)).to(value.dtype).sum(-1) / max(n - 1, 1) - 1
+    )

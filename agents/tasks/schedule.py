@@ -3,10 +3,10 @@
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from agents.tasks.gains import anchor_gains, log_gain, range_gains
+from agents.tasks.gains import anchor_gains, log_gain, range_gains, rank
 from agents.tasks.task import (
     ESTIMATOR,
     MOST_ERROR,
@@ -198,7 +198,7 @@ class Schedule(Task):
         """Gain of each call, ranks of σ and gain, success and calls of all, whose turn it is."""
         n = self.n_agents
         gain, sigma = memory.more["gain"], own_sigma(memory.joint)
-        ranks = [_rank(sigma), _rank(gain.amax(-1))]
+        ranks = [rank(sigma), rank(gain.amax(-1))]
         i = torch.arange(n)
         others = (i[:, None] + torch.arange(n)) % n
         called = (memory.more["called"] > 0).to(gain.dtype)[:, others]
@@ -209,11 +209,3 @@ class Schedule(Task):
 
     def reward(self, memory: TaskMemory, world: World) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
         return memory, -self.error(memory, world) / MOST_ERROR
-
-
-def _rank(value: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
-    """−1 for the smallest of the team, 1 for the largest."""
-    n = value.shape[-1]
-    return (
-        2 * (value.unsqueeze(-1) > value.unsqueeze(-2)).to(value.dtype).sum(-1) / max(n - 1, 1) - 1
-    )

@@ -128,7 +128,7 @@ def _with_others(policy: Policy, others: Policy) -> Policy:
 
 def _run(task: Task, policy: Policy, seeds: Tensor) -> dict[str, Floats]:
     """Per world: the team's mean return, that of uav_0, mean error (m), messages, bytes, distance
-    flown (m), of those that act."""
+    travelled (m), of those that act."""
     team = first = error = distance = torch.zeros(len(seeds), dtype=torch.float64)
     before: Tensor | None = None
     n = task.n_agents

@@ -79,7 +79,28 @@ class WheeledProcess(Process):
         return torch.cat((delta[..., :2], torch.zeros_like(delta[..., :2])), -1)
 
 
-class InsProcess(Process):
+class PositionError(Process):
+    """x = [p, v] whose velocity is given, not estimated: the error is δp."""
+
+    def __init__(self, dim: int, dt: float) -> None:
+        super().__init__(dim, dt)
+        self.state_size, self.error_size, self.noise_size = 2 * dim, dim, dim
+
+    def _initial(
+        self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s 2d"]
+    ) -> tuple[Float[Tensor, "*s 2d"], Float[Tensor, "*s d d"]]:
+        return mean[..., : self.state_size], torch.diag_embed(std[..., : self.dim] ** 2)
+
+    def boxminus(
+        self, x: Float[Tensor, "*s 2d"], y: Float[Tensor, "*s 2d"]
+    ) -> Float[Tensor, "*s d"]:
+        return x[..., : self.dim] - y[..., : self.dim]
+
+    def _linear(self, delta: Float[Tensor, "*s d"]) -> Float[Tensor, "*s 2d"]:
+        return torch.cat((delta, torch.zeros_like(delta)), -1)
+
+
+class InsProcess(PositionError):
     """x = [p, v], u = the INS's velocity: p' = p + u dt, v' = u.
 
     The velocity is the INS's, not an estimated quantity: the error is δp.
@@ -90,12 +111,6 @@ class InsProcess(Process):
     ) -> None:
         super().__init__(dim, dt)
         self.std = (ins.std**2 + settings.bias_share * ins.bias**2) ** 0.5
-        self.state_size, self.error_size, self.noise_size = 2 * dim, dim, dim
-
-    def _initial(
-        self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s 2d"]
-    ) -> tuple[Float[Tensor, "*s 2d"], Float[Tensor, "*s d d"]]:
-        return mean[..., : self.state_size], torch.diag_embed(std[..., : self.dim] ** 2)
 
     def inputs(self, observation: Observation) -> Float[Tensor, "B N d"]:
         return observation["ins"].double()
@@ -125,16 +140,8 @@ class InsProcess(Process):
         q = (self.std * dt[..., None, None]) ** 2 * eye
         return eye.expand_as(q), q
 
-    def boxminus(
-        self, x: Float[Tensor, "*s 2d"], y: Float[Tensor, "*s 2d"]
-    ) -> Float[Tensor, "*s d"]:
-        return x[..., : self.dim] - y[..., : self.dim]
 
-    def _linear(self, delta: Float[Tensor, "*s d"]) -> Float[Tensor, "*s 2d"]:
-        return torch.cat((delta, torch.zeros_like(delta)), -1)
-
-
-class DisplacementProcess(Process):
+class DisplacementProcess(PositionError):
     """x = [p, v], u = the measured displacement: p' = p + u, v' = u / dt; the error is δp.
 
     Q = (s₀² + s₁² D) I, D the distance that a displacement of u most likely came from.
@@ -143,12 +150,6 @@ class DisplacementProcess(Process):
     def __init__(self, dim: int, dt: float, sensor: Displacement) -> None:
         super().__init__(dim, dt)
         self.sensor = sensor
-        self.state_size, self.error_size, self.noise_size = 2 * dim, dim, dim
-
-    def _initial(
-        self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s 2d"]
-    ) -> tuple[Float[Tensor, "*s 2d"], Float[Tensor, "*s d d"]]:
-        return mean[..., : self.state_size], torch.diag_embed(std[..., : self.dim] ** 2)
 
     def inputs(self, observation: Observation) -> Float[Tensor, "B N d"]:
         return observation["displacement"].double()
@@ -183,11 +184,3 @@ class DisplacementProcess(Process):
         eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
         q = self._variance(u, dt).unsqueeze(-1) * eye
         return eye.expand_as(q), q
-
-    def boxminus(
-        self, x: Float[Tensor, "*s 2d"], y: Float[Tensor, "*s 2d"]
-    ) -> Float[Tensor, "*s d"]:
-        return x[..., : self.dim] - y[..., : self.dim]
-
-    def _linear(self, delta: Float[Tensor, "*s d"]) -> Float[Tensor, "*s 2d"]:
-        return torch.cat((delta, torch.zeros_like(delta)), -1)
