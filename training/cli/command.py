@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.recording import recording, recordings
 from training.cli.render import render
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
@@ -64,6 +65,7 @@ for _command in (
     score,
     scenarios,
     agents,
+    recordings,
     tasks,
     render,
     bench,
@@ -71,6 +73,7 @@ for _command in (
     reproduce,
 ):
     app.command()(_command)
+app.add_typer(recording, name="recording")
 
 
 def _print_version(wanted: bool) -> None:

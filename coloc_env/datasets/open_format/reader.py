@@ -91,7 +91,9 @@ def _track(home: Path, about: Description, read: Read) -> Track:
 
 def _only(home: Path, stem: str, suffixes: tuple[str, ...] = TABLES) -> Path | None:
     """The one file of a name, whatever its suffix; None if there is none."""
-    found = [home / f"{stem}{suffix}" for suffix in suffixes if (home / f"{stem}{suffix}").is_file()]
+    found = [
+        home / f"{stem}{suffix}" for suffix in suffixes if (home / f"{stem}{suffix}").is_file()
+    ]
     if len(found) > 1:
         raise DataError(f"{home}: {found[0].name} and {found[1].name} say the same")
     return found[0] if found else None

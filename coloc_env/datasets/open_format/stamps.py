@@ -22,7 +22,8 @@ def nanoseconds(texts: Sequence[str], unit: str) -> Stamps:
     for i, text in enumerate(texts):
         whole, _, part = text.partition(".")
         try:
-            if len(part) > digits or not (text[-1:].isdigit() or text[:1].isdigit()):
+            begun = text[-1:].isdigit() or text[:1].isdigit()
+            if len(part) > digits or not begun or "_" in text:
                 raise ValueError
             time = int(whole + part.ljust(digits, "0"))
         except ValueError:

@@ -20,7 +20,6 @@ from coloc_env.datasets.recording import (
     Recording,
     Stamps,
     Table,
-    one_hemisphere,
     plausible,
 )
 
@@ -73,7 +72,9 @@ def start_in_world(about: Description) -> Floats:
     if not len(start):
         return start
     turned = start[:, dim:]
-    turned = frames.heading(turned, about.frame) if dim == 2 else frames.attitude(turned, about.frame)
+    turned = (
+        frames.heading(turned, about.frame) if dim == 2 else frames.attitude(turned, about.frame)
+    )
     return np.concatenate((frames.world(start[:, :dim], about.frame), turned), 1)
 
 
@@ -169,9 +170,7 @@ def _seen(found: Columns, about: Description) -> NDArray[np.int64]:
             neither = np.array([not a and not b for a, b in zip(names, other, strict=True)], bool)
             if neither.any():
                 found.fail(neither, column, "names no landmark and no robot")
-    whole = replace(
-        found, names={"of": [a or b for a, b in zip(robots, landmarks, strict=True)]}
-    )
+    whole = replace(found, names={"of": [a or b for a, b in zip(robots, landmarks, strict=True)]})
     seen = indices(whole, "of", (*about.robots, *about.landmarks))
     count, own = len(about.robots), about.robots.index(found.path.parent.name)
     named = np.array([bool(name) for name in robots], bool)
@@ -185,11 +184,11 @@ def _seen(found: Columns, about: Description) -> NDArray[np.int64]:
     return seen
 
 
-def _bearings(
-    found: Columns, about: Description
-) -> tuple[str, tuple[str, ...], Floats, Flags]:
+def _bearings(found: Columns, about: Description) -> tuple[str, tuple[str, ...], Floats, Flags]:
     if about.dim == 3:
-        raise DataError(f"{found.path}, line 1: range and bearing are for 2 dimensions; use x, y, z")
+        raise DataError(
+            f"{found.path}, line 1: range and bearing are for 2 dimensions; use x, y, z"
+        )
     values = found.require("range", "bearing") * (about.length, about.angle)
     values[:, 1] = frames.turn(values[:, 1], about.frame)
     wide = np.isfinite(values[:, 1]) & (np.abs(values[:, 1]) > 2 * np.pi)
@@ -297,8 +296,7 @@ FILES: dict[str, _File] = {
         _ranges,
     ),
     "sightings": _File(
-        _kinds("name", "landmark", "robot")
-        | _kinds("measured", "x", "y", "z", "range", "bearing"),
+        _kinds("name", "landmark", "robot") | _kinds("measured", "x", "y", "z", "range", "bearing"),
         _sightings,
     ),
     "height": _File(_kinds("measured", "height", "z"), _height),

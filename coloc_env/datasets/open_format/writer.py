@@ -59,9 +59,7 @@ def _description(recording: Recording) -> dict[str, Any]:
         "exchanges": "listed",
     }
     places = {
-        "landmarks": dict(
-            zip(recording.landmark_names, recording.landmarks.tolist(), strict=True)
-        ),
+        "landmarks": dict(zip(recording.landmark_names, recording.landmarks.tolist(), strict=True)),
         "anchors": dict(zip(recording.anchor_names, recording.anchors.tolist(), strict=True)),
     }
     about["map"] = {kind: found for kind, found in places.items() if found}

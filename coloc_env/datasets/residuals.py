@@ -1,0 +1,149 @@
+"""What sensors said less what the truth says: residuals of a recording's measurements.
+
+Truth is interpolated between its samples, and only where they are at most 0.25 s apart.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table, Track
+
+_HOLE = 250_000_000  # ns between samples of truth that are bridged
+_MANY = 50  # ranges, of fewer of which no delay is told
+_LATEST = 600_000_000  # ns, the largest delay that is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Ranges of one link, ``ROBOT/OTHER``: times [T], own and other's tag, and ranges (m)."""
+
+    name: str
+    robot: int
+    other: int
+    to_anchor: bool
+    time: Stamps
+    tags: NDArray[np.int64]
+    measured: Floats
+
+
+def links_of(recording: Recording, stream: str) -> list[Link]:
+    """A stream of ranges, link by link."""
+    to_anchor = stream == "anchor_ranges"
+    names = recording.anchor_names if to_anchor else recording.robots
+    found = []
+    for robot, table in enumerate(recording.streams.get(stream, ())):
+        ends = table.values[:, 1].astype(np.int64)
+        for other in np.unique(ends):
+            there = ends == other
+            own = table.values[there, 0]
+            theirs = np.zeros(len(own)) if to_anchor else table.values[there, 2]
+            name = f"{recording.robots[robot]}/{names[other]}"
+            tags = np.stack((own, theirs), 1).astype(np.int64)
+            link = Link(
+                name, robot, int(other), to_anchor, table.time[there], tags, table.values[there, -1]
+            )
+            found.append(link)
+    return found
+
+
+def pose_at(track: Track, time: Stamps) -> tuple[Floats, Floats, Flags]:
+    """Position [T, d], attitude [T, a] and where they are known, at some times."""
+    zero = track.time[0]
+    x, xp = (time - zero) * 1e-9, (track.time - zero) * 1e-9
+    after = np.searchsorted(track.time, time).clip(1, max(1, len(track.time) - 1))
+    gap = track.time[after.clip(0, len(track.time) - 1)] - track.time[after - 1]
+    known = (time >= zero) & (time <= track.time[-1]) & (gap <= _HOLE)
+    position, attitude = (
+        np.stack([np.interp(x, xp, column) for column in values.T], 1)
+        for values in (track.position, track.attitude)
+    )
+    if attitude.shape[1] == 4:
+        attitude = attitude / np.linalg.norm(attitude, axis=1, keepdims=True)
+    return position, attitude, known
+
+
+def turned(attitude: Floats, vectors: Floats) -> Floats:
+    """Body vectors [T, d] in the world, by attitudes [T, a]."""
+    if attitude.shape[1] == 1:
+        c, s = np.cos(attitude[:, 0]), np.sin(attitude[:, 0])
+        x, y = vectors.T
+        return np.stack((c * x - s * y, s * x + c * y), 1)
+    t = 2 * np.cross(attitude[:, 1:], vectors)
+    return vectors + attitude[:, :1] * t + np.cross(attitude[:, 1:], t)
+
+
+def tag_at(
+    recording: Recording, robot: int, tag: NDArray[np.int64], time: Stamps
+) -> tuple[Floats, Flags]:
+    """World positions [T, d] of a robot's tags, and where they are known."""
+    position, attitude, known = pose_at(recording.truth[robot], time)
+    if recording.tags.shape[1]:
+        position = position + turned(attitude, np.nan_to_num(recording.tags[robot][tag]))
+    return position, known
+
+
+def true_ranges(recording: Recording, link: Link, delay: float = 0.0) -> tuple[Floats, Flags]:
+    """Distances [T] (m) by the truth ``delay`` s before each stamp, and where they are known."""
+    time = link.time - round(delay * 1e9)
+    own, known = tag_at(recording, link.robot, link.tags[:, 0], time)
+    if link.to_anchor:
+        other: Floats = recording.anchors[link.other]
+    else:
+        other, there = tag_at(recording, link.other, link.tags[:, 1], time)
+        known = known & there
+    return np.linalg.norm(own - other, axis=1), known
+
+
+def sighting_residuals(recording: Recording, stream: str, robot: int) -> tuple[Floats, Flags]:
+    """Range (m) and bearing (rad) [T, 2] less the truth's, and where that is known."""
+    table: Table = recording.streams[stream][robot]
+    position, heading, known = pose_at(recording.truth[robot], table.time)
+    seen = table.values[:, 0].astype(np.int64)
+    if stream == "landmark_bearings":
+        places = recording.landmarks[seen]
+    else:
+        places = np.zeros_like(position)
+        for other in np.unique(seen):
+            there = seen == other
+            places[there], _, near = pose_at(recording.truth[other], table.time[there])
+            known[there] &= near
+    apart = places - position
+    angle = np.arctan2(apart[:, 1], apart[:, 0]) - heading[:, 0]
+    off = np.stack((np.linalg.norm(apart, axis=1), angle), 1)
+    residual = table.values[:, 1:3] - off
+    residual[:, 1] = (residual[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    return residual, known
+
+
+def robust(values: Floats) -> tuple[float, float]:
+    """Median, and the standard deviation that the median absolute deviation stands for."""
+    if not len(values):
+        return float("nan"), float("nan")
+    middle = float(np.median(values))
+    return middle, float(1.4826 * np.median(np.abs(values - middle)))
+
+
+def best_delay(recording: Recording, link: Link) -> float:
+    """The delay (s, to the hundredth) with which a link's ranges fit the truth best: the least
+    robust deviation. 0 where the motion shows nothing of it: the deviation must fall by a tenth."""
+    delays = np.arange(-_LATEST, _LATEST + 1, 20_000_000) * 1e-9
+    spread = np.array([_spread(recording, link, delay) for delay in delays])
+    if np.isnan(spread).any():
+        return 0.0
+    best = int(np.argmin(spread))
+    now = spread[len(delays) // 2]
+    if not 0 < best < len(delays) - 1 or spread[best] > 0.9 * now:
+        return 0.0
+    left, middle, right = spread[best - 1 : best + 2]
+    bend = left - 2 * middle + right
+    shift = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float(np.round(delays[best] + 0.02 * shift, 3))
+
+
+def _spread(recording: Recording, link: Link, delay: float) -> float:
+    distance, known = true_ranges(recording, link, delay)
+    if known.sum() < _MANY:
+        return float("nan")
+    return robust((link.measured - distance)[known])[1]
