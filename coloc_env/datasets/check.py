@@ -88,7 +88,7 @@ def _link(recording: Recording, link: Link) -> LinkReport | None:
     ends = [link.robot] if link.to_anchor else [link.robot, link.other]
     if not all(len(recording.truth[end].time) > 1 for end in ends):
         return None
-    delay = best_delay(recording, link)
+    delay = best_delay(recording, [link])
     distance, known = true_ranges(recording, link, delay)
     error = (link.measured - distance)[known]
     if len(error) < 5:

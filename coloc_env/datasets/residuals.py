@@ -3,6 +3,7 @@
 Truth is interpolated between its samples, and only where they are at most 0.25 s apart.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,25 +126,43 @@ def robust(values: Floats) -> tuple[float, float]:
     return middle, float(1.4826 * np.median(np.abs(values - middle)))
 
 
-def best_delay(recording: Recording, link: Link) -> float:
-    """The delay (s, to the hundredth) with which a link's ranges fit the truth best: the least
-    robust deviation. 0 where the motion shows nothing of it: the deviation must fall by a tenth."""
+def best_delay(recording: Recording, links: Sequence[Link]) -> float:
+    """The delay (s) with which ranges of some links fit the truth best: the least robust deviation,
+    all links' together. 0 where the motion shows nothing of it: the deviation must fall by a tenth.
+    """
     delays = np.arange(-_LATEST, _LATEST + 1, 20_000_000) * 1e-9
-    spread = np.array([_spread(recording, link, delay) for delay in delays])
-    if np.isnan(spread).any():
+    curves = [[spread(recording, link, delay) for delay in delays] for link in links]
+    known = np.array([curve for curve in curves if not np.isnan(curve).any()])
+    if not len(known):
         return 0.0
-    best = int(np.argmin(spread))
-    now = spread[len(delays) // 2]
-    if not 0 < best < len(delays) - 1 or spread[best] > 0.9 * now:
+    whole = np.log(np.maximum(known, 1e-4)).mean(0)
+    best = int(np.argmin(whole))
+    if not 0 < best < len(delays) - 1 or whole[best] > whole[len(delays) // 2] + np.log(0.9):
         return 0.0
-    left, middle, right = spread[best - 1 : best + 2]
+    left, middle, right = whole[best - 1 : best + 2]
     bend = left - 2 * middle + right
     shift = 0.5 * (left - right) / bend if bend > 0 else 0.0
     return float(np.round(delays[best] + 0.02 * shift, 3))
 
 
-def _spread(recording: Recording, link: Link, delay: float) -> float:
+def spread(recording: Recording, link: Link, delay: float) -> float:
+    """The robust deviation (m) of a link's ranges ``delay`` s late about a line over the distance;
+    NaN where there are too few."""
     distance, known = true_ranges(recording, link, delay)
     if known.sum() < _MANY:
         return float("nan")
-    return robust((link.measured - distance)[known])[1]
+    return robust(_detrended(distance[known], (link.measured - distance)[known]))[1]
+
+
+def _detrended(distance: Floats, error: Floats) -> Floats:
+    """Errors less a line over the distance, by reweighted least squares: a bias that grows with the
+    distance is not to pass for a delay."""
+    x = distance - np.median(distance)
+    rest, weight = error, np.ones(len(error))
+    for _ in range(4):
+        centre, offset = np.average(x, weights=weight), np.average(error, weights=weight)
+        power = float((weight * (x - centre) ** 2).sum())
+        slope = float((weight * (x - centre) * (error - offset)).sum()) / max(power, 1e-9)
+        rest = error - offset - slope * (x - centre)
+        weight = 1 / np.maximum(np.abs(rest), 0.02)
+    return rest

@@ -16,7 +16,7 @@ FRAMES = ("enu", "ned", "utm")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 ACCELERATIONS = {"m/s2": 1.0, "g": 9.80665}
-_KEYS = (
+KEYS = (
     "name", "dim", "robots", "frame", "units", "time", "map", "tags", "source", "licence", "origin",
     "exchanges", "start", "dropped", "believed",
 )  # fmt: skip
@@ -59,7 +59,7 @@ def read_description(folder: Path) -> Description:
         DataError: the file is missing or damaged, or an entry is unknown, missing or no such thing.
     """
     file = YamlFile(folder / FILE)
-    file.allow((), _KEYS)
+    file.allow((), KEYS)
     dim = file.whole("dim", default=0)
     if dim not in (2, 3):
         file.fail(("dim",), f"{dim} is not 2 or 3")

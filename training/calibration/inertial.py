@@ -1,0 +1,214 @@
+"""IMUs: noise by Allan variance where they stand still, biases and noise against truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coloc_env.datasets.noise_model import ImuBias, ImuModel
+from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.residuals import pose_at, turned
+
+_DT = 0.1  # s, of the steps whose noise is told
+_STILL = 2.0  # s: shorter than this nothing is learnt from standing
+_QUIET = (0.02, 0.15)  # rad/s, m/s²: a second with less spread than this is one of standing still
+_G = 9.80665
+_WINDOWS = (1.0, 2.0, 4.0)  # s over which increments are compared with truth
+
+
+@dataclass(frozen=True)
+class Allan:
+    """Allan deviations [M, 6] at averaging times [M] (s): of gyro (rad/s), accelerometer (m/s²).
+
+    ``white``: noise density per √Hz [6], ``instability``: the least deviation over 0.664 [6].
+    """
+
+    tau: Floats
+    deviation: Floats
+
+    @property
+    def white(self) -> Floats:
+        """N = σ(τ) √τ where averaging helps: at the shortest times."""
+        short: Floats = np.median(self.deviation[:3] * np.sqrt(self.tau[:3, None]), axis=0)
+        return short
+
+    @property
+    def instability(self) -> Floats:
+        least: Floats = self.deviation.min(0) / 0.664
+        return least
+
+
+def allan(values: Floats, rate: float) -> Allan:
+    """Overlapping Allan deviation of samples [T, 6] at ``rate`` Hz, at times up to a fifth of all.
+
+    σ²(τ) = ⟨(θ_{k+2m} − 2 θ_{k+m} + θ_k)²⟩ / (2 τ²), θ the integral (IEEE Std 952-1997, annex C).
+    """
+    theta = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, 0))) / rate
+    most = max(2, len(values) // 5)
+    sizes = np.unique(np.logspace(0, np.log10(most), 24).astype(int))
+    deviation = []
+    for m in sizes:
+        bend = theta[2 * m :] - 2 * theta[m:-m] + theta[: -2 * m]
+        tau = m / rate
+        deviation.append(np.sqrt((bend**2).mean(0) / (2 * tau**2)))
+    return Allan(sizes / rate, np.stack(deviation))
+
+
+def standing(table: Table) -> tuple[int, int] | None:
+    """First and last index of the longest stretch in which an IMU stands still; None if there is
+    none of 2 s."""
+    if len(table.time) < 100:
+        return None
+    second = ((table.time - table.time[0]) // 10**9).astype(np.int64)
+    starts = np.searchsorted(second, np.arange(second[-1] + 2))
+    quiet = []
+    for a, b in zip(starts[:-1], starts[1:], strict=True):
+        part = table.values[a:b]
+        calm = len(part) > 5 and part[:, :3].std(0).max() < _QUIET[0]
+        quiet.append(calm and part[:, 3:].std(0).max() < _QUIET[1])
+    best, length, run = None, 0, 0
+    for i, calm in enumerate([*quiet, False]):
+        run = run + 1 if calm else 0
+        if run > length:
+            best, length = (int(starts[i + 1 - run]), int(starts[i + 1])), run
+    return best if length >= _STILL else None
+
+
+def allan_of(table: Table) -> Allan | None:
+    """Of the longest stretch that an IMU stands still."""
+    found = standing(table)
+    if found is None:
+        return None
+    first, last = found
+    rate = (last - first - 1) / ((table.time[last - 1] - table.time[first]) * 1e-9)
+    return allan(table.values[first:last], float(rate))
+
+
+def calibrate_imu(recording: Recording) -> ImuModel | None:
+    """The team's IMUs: each one's biases and the noise of all, against truth where there is any,
+    else from standing still."""
+    biases: dict[str, ImuBias] = {}
+    gyro_noise, accel_noise, left = [], [], []
+    for robot, name in enumerate(recording.robots):
+        table, track = recording.streams["imu"][robot], recording.truth[robot]
+        if len(track.time) > 1 and recording.dim == 3:
+            found = _against_truth(table, track)
+            if found is None:
+                continue
+            biases[name] = found.bias
+            gyro_noise.append(found.gyro)
+            accel_noise.append(found.accel)
+            left.append(found.left)
+        else:
+            still = standing(table)
+            density = allan_of(table)
+            if still is None or density is None:
+                continue
+            mean = table.values[still[0] : still[1], :3].mean(0)
+            biases[name] = ImuBias(gyro=tuple(mean.tolist()))
+            gyro_noise.append(float(density.white[:3].mean()) / _DT**0.5)
+            accel_noise.append(float(density.white[3:].mean()) / _DT**0.5)
+    if not biases:
+        return None
+    root = lambda values: float(np.sqrt(np.mean(np.square(values))))  # noqa: E731
+    defaults = ImuModel()
+    gyro_left = root([each[0] for each in left]) if left else defaults.gyro_bias
+    accel_left = root([each[1] for each in left]) if left else defaults.accel_bias
+    return ImuModel(
+        accel_std=root(accel_noise),
+        gyro_std=root(gyro_noise),
+        accel_bias=max(accel_left, 1e-3),
+        gyro_bias=max(gyro_left, 1e-5),
+        robots=biases,
+    )
+
+
+# ------------------------------------------------------------------ against truth
+
+
+@dataclass(frozen=True)
+class _Found:
+    bias: ImuBias
+    gyro: float
+    accel: float
+    left: tuple[float, float]
+
+
+def _against_truth(table: Table, track: Track) -> _Found | None:
+    """Biases by least squares on increments of attitude and velocity, and the noise that is left:
+    Var(τ) = c² + σ² dt τ, c the truth's own error, which does not add up."""
+    start, end = max(table.time[0], track.time[0]), min(table.time[-1], track.time[-1])
+    if (end - start) * 1e-9 < 5 * max(_WINDOWS):
+        return None
+    by_window = [_increments(table, track, int(start), int(end), tau) for tau in _WINDOWS]
+    if any(len(turn) < 4 for turn, _ in by_window):
+        return None
+    turn, speed = by_window[0]
+    gyro, accel = (np.median(each, 0) / _WINDOWS[0] for each in (turn, speed))
+    half = len(turn) // 2
+    left = [
+        float(np.abs(np.median(x[:half], 0) - np.median(x[half:], 0)).mean() / _WINDOWS[0] / 2)
+        for x in (turn, speed)
+    ]
+    noise = []
+    for which, bias in ((0, gyro), (1, accel)):
+        variance = [
+            float(np.median((each[which] - bias * tau) ** 2) / 0.4549)
+            for each, tau in zip(by_window, _WINDOWS, strict=True)
+        ]
+        slope = np.polyfit(_WINDOWS, variance, 1)[0]
+        noise.append(float(np.sqrt(max(slope, 0.05 * variance[0]) / _DT)))
+    bias = ImuBias(tuple(gyro.tolist()), tuple(accel.tolist()))
+    return _Found(bias, noise[0], noise[1], (left[0], left[1]))
+
+
+def _increments(
+    table: Table, track: Track, start: int, end: int, tau: float
+) -> tuple[Floats, Floats]:
+    """What is read less what is true over windows of ``tau`` s: turn (rad) and speed gained (m/s)
+    in the body frame, [T, 3] each."""
+    edges = np.arange(start, end, round(tau * 1e9))
+    position, attitude, known = pose_at(track, table.time)
+    velocity = _velocity(track, edges)
+    _, pose, there = pose_at(track, edges)
+    step = np.diff(table.time, append=table.time[-1:]) * 1e-9
+    force = turned(attitude, table.values[:, 3:]) * step[:, None]
+    total = np.concatenate((np.zeros((1, 3)), np.cumsum(force, 0)))
+    at = np.searchsorted(table.time, edges)
+    gained = total[at[1:]] - total[at[:-1]]
+    lasted = (table.time[at[1:].clip(max=len(step) - 1)] - table.time[at[:-1]]) * 1e-9
+    true = np.diff(velocity, axis=0) + np.array((0.0, 0.0, _G)) * lasted[:, None]
+    middle = pose[:-1]
+    conjugate = middle * (1, -1, -1, -1)
+    speed = turned(conjugate, gained - true)
+    turn = _turns(table, at, step) - _between(pose[:-1], pose[1:])
+    sound = there[:-1] & there[1:] & known[at[:-1].clip(max=len(known) - 1)]
+    return turn[sound], speed[sound]
+
+
+def _velocity(track: Track, at: Stamps) -> Floats:
+    """Velocities by the truth's positions 0.1 s around."""
+    ahead, behind = (pose_at(track, at + by)[0] for by in (50_000_000, -50_000_000))
+    return (ahead - behind) / 0.1
+
+
+def _turns(table: Table, at: np.ndarray, step: Floats) -> Floats:
+    """Rotation vectors between samples ``at``, by the gyro."""
+    from scipy.spatial.transform import Rotation
+
+    found = []
+    for a, b in zip(at[:-1], at[1:], strict=True):
+        whole = Rotation.identity()
+        pieces = Rotation.from_rotvec(table.values[a:b, :3] * step[a:b, None])
+        for piece in pieces:
+            whole = whole * piece
+        found.append(whole.as_rotvec())
+    return np.array(found)
+
+
+def _between(a: Floats, b: Floats) -> Floats:
+    """Rotation vectors [T, 3] from attitude a to b (wxyz), in a's body frame."""
+    from scipy.spatial.transform import Rotation
+
+    first, second = (Rotation.from_quat(np.roll(q, -1, 1)) for q in (a, b))
+    turn: Floats = (first.inv() * second).as_rotvec()
+    return turn
