@@ -19,7 +19,7 @@ _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
 _HELD = 100_000_000  # ns, for which a sample of an IMU stands
 _PHASES = 32  # of a step, tried
-_LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns that name a link
+_LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
@@ -78,12 +78,15 @@ def aligned(grid: Grid, recording: Recording, streams: tuple[str, ...]) -> Grid:
     for offset in (np.arange(_PHASES) * period) // _PHASES:
         late = time - grid.start - offset
         age = float((-late % period).mean())
-        twice = sum(
-            _repeats(-((grid.start + offset - each) // period), link) for each, link in pairs
-        )
+        twice = sum(_repeats(_delivered(grid, offset, each), link) for each, link in pairs)
         if (twice, age) < least:
             best, least = int(offset), (twice, age)
     return Grid(grid.start + best, grid.dt, grid.count - (best > 0))
+
+
+def _delivered(grid: Grid, offset: int, time: Stamps) -> NDArray[np.int64]:
+    """The steps that deliver measurements of some times on the grid shifted by ``offset`` ns."""
+    return -((grid.start + offset - time) // round(grid.dt * 1e9))
 
 
 def _links(recording: Recording, stream: str) -> tuple[Stamps, NDArray[np.int64]]:

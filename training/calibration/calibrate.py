@@ -1,6 +1,7 @@
 """Everything that a recording shows of its sensors, as a noise model that filters believe in."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,11 +35,12 @@ def calibrate(recording: Recording, *, motion: str = "auto") -> Calibration:
     """
     if not any(len(track.time) > 1 for track in recording.truth):
         raise DataError(f"{recording.name}: no robot has truth to calibrate against")
-    model, noises = NoiseModel(), {}
+    model = NoiseModel()
+    noises: dict[str, Noise] = {}
     for stream in ("anchor_ranges", "uav_ranges"):
         found = calibrate_ranges(recording, stream)
         if found is not None:
-            model = replace(model, **{stream: found[0]})
+            model = _with(model, stream, found[0])
             noises |= found[1]
     if "anchor_ranges" in recording.streams:
         anchors = refined_anchors(recording, model.anchor_ranges)
@@ -48,7 +50,7 @@ def calibrate(recording: Recording, *, motion: str = "auto") -> Calibration:
         if stream in recording.streams:
             seen = calibrate_sightings(recording, stream)
             if seen is not None:
-                model = replace(model, **{stream: seen[0]})
+                model = _with(model, stream, seen[0])
                 noises |= {f"{name} ({stream})": noise for name, noise in seen[1].items()}
     if "height" in recording.streams:
         height = calibrate_heights(recording)
@@ -117,6 +119,10 @@ def part_of(recording: Recording, span: tuple[float, float]) -> Recording:
         streams={name: tuple(map(cut, team)) for name, team in recording.streams.items()},
         points=tuple(map(cut, recording.points)),
     )
+
+
+def _with(model: NoiseModel, stream: str, part: Any) -> NoiseModel:
+    return replace(model, **{stream: part})
 
 
 def _positions(track: Track, time: np.ndarray) -> Floats:

@@ -1,8 +1,12 @@
 """IMUs: noise by Allan variance where they stand still, biases and noise against truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coloc_env.datasets.noise_model import ImuBias, ImuModel
 from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
@@ -12,7 +16,8 @@ _DT = 0.1  # s, of the steps whose noise is told
 _STILL = 2.0  # s: shorter than this nothing is learnt from standing
 _QUIET = (0.02, 0.15)  # rad/s, m/s²: a second with less spread than this is one of standing still
 _G = 9.80665
-_WINDOWS = (1.0, 2.0, 4.0)  # s over which increments are compared with truth
+_BASE = 0.5  # s, of the shortest increments that are compared with truth,
+_WINDOWS = (2, 6, 12)  # of these are the windows over which errors are watched grow
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,7 @@ def standing(table: Table) -> tuple[int, int] | None:
     second = ((table.time - table.time[0]) // 10**9).astype(np.int64)
     starts = np.searchsorted(second, np.arange(second[-1] + 2))
     quiet = []
-    for a, b in zip(starts[:-1], starts[1:], strict=True):
+    for a, b in pairwise(starts):
         part = table.values[a:b]
         calm = len(part) > 5 and part[:, :3].std(0).max() < _QUIET[0]
         quiet.append(calm and part[:, 3:].std(0).max() < _QUIET[1])
@@ -109,7 +114,6 @@ def calibrate_imu(recording: Recording) -> ImuModel | None:
             accel_noise.append(float(density.white[3:].mean()) / _DT**0.5)
     if not biases:
         return None
-    root = lambda values: float(np.sqrt(np.mean(np.square(values))))  # noqa: E731
     defaults = ImuModel()
     gyro_left = root([each[0] for each in left]) if left else defaults.gyro_bias
     accel_left = root([each[1] for each in left]) if left else defaults.accel_bias
@@ -120,6 +124,11 @@ def calibrate_imu(recording: Recording) -> ImuModel | None:
         gyro_bias=max(gyro_left, 1e-5),
         robots=biases,
     )
+
+
+def root(values: Sequence[float]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 # ------------------------------------------------------------------ against truth
@@ -137,51 +146,50 @@ def _against_truth(table: Table, track: Track) -> _Found | None:
     """Biases by least squares on increments of attitude and velocity, and the noise that is left:
     Var(τ) = c² + σ² dt τ, c the truth's own error, which does not add up."""
     start, end = max(table.time[0], track.time[0]), min(table.time[-1], track.time[-1])
-    if (end - start) * 1e-9 < 5 * max(_WINDOWS):
+    if (end - start) * 1e-9 < 2 * _BASE * max(_WINDOWS):
         return None
-    by_window = [_increments(table, track, int(start), int(end), tau) for tau in _WINDOWS]
-    if any(len(turn) < 4 for turn, _ in by_window):
+    edges = np.arange(start + 10**8, end - 10**8, round(_BASE * 1e9))
+    parts = [_increments(table, track, edges, size) for size in _WINDOWS]
+    if any(len(turn) < 4 for turn, _ in parts):
         return None
-    turn, speed = by_window[0]
-    gyro, accel = (np.median(each, 0) / _WINDOWS[0] for each in (turn, speed))
-    half = len(turn) // 2
-    left = [
-        float(np.abs(np.median(x[:half], 0) - np.median(x[half:], 0)).mean() / _WINDOWS[0] / 2)
-        for x in (turn, speed)
-    ]
-    noise = []
-    for which, bias in ((0, gyro), (1, accel)):
+    spans = [size * _BASE for size in _WINDOWS]
+    biases, noises, left = [], [], []
+    for which in (0, 1):
+        rate = parts[0][which] / spans[0]
+        bias, half = np.median(rate, 0), len(rate) // 2
+        early, late = np.median(rate[:half], 0), np.median(rate[half:], 0)
         variance = [
-            float(np.median((each[which] - bias * tau) ** 2) / 0.4549)
-            for each, tau in zip(by_window, _WINDOWS, strict=True)
+            float(np.median((part[which] - bias * span) ** 2) / 0.4549)
+            for part, span in zip(parts, spans, strict=True)
         ]
-        slope = np.polyfit(_WINDOWS, variance, 1)[0]
-        noise.append(float(np.sqrt(max(slope, 0.05 * variance[0]) / _DT)))
-    bias = ImuBias(tuple(gyro.tolist()), tuple(accel.tolist()))
-    return _Found(bias, noise[0], noise[1], (left[0], left[1]))
+        slope = float(np.polyfit(spans, variance, 1)[0])
+        biases.append(tuple(bias.tolist()))
+        noises.append(float(np.sqrt(max(slope, 0.02 * variance[0] / spans[0]) / _DT)))
+        left.append(float(np.abs(early - late).mean() / 2))
+    return _Found(ImuBias(biases[0], biases[1]), noises[0], noises[1], (left[0], left[1]))
 
 
-def _increments(
-    table: Table, track: Track, start: int, end: int, tau: float
-) -> tuple[Floats, Floats]:
-    """What is read less what is true over windows of ``tau`` s: turn (rad) and speed gained (m/s)
-    in the body frame, [T, 3] each."""
-    edges = np.arange(start, end, round(tau * 1e9))
-    position, attitude, known = pose_at(track, table.time)
-    velocity = _velocity(track, edges)
+def _increments(table: Table, track: Track, edges: Stamps, size: int) -> tuple[Floats, Floats]:
+    """What is read less what is true over overlapping windows of ``size`` edges: turn (rad) and
+    speed gained (m/s) in the body frame at the start, [T, 3] each."""
+    _, attitude, known = pose_at(track, table.time)
     _, pose, there = pose_at(track, edges)
+    velocity = _velocity(track, edges)
     step = np.diff(table.time, append=table.time[-1:]) * 1e-9
     force = turned(attitude, table.values[:, 3:]) * step[:, None]
     total = np.concatenate((np.zeros((1, 3)), np.cumsum(force, 0)))
     at = np.searchsorted(table.time, edges)
-    gained = total[at[1:]] - total[at[:-1]]
-    lasted = (table.time[at[1:].clip(max=len(step) - 1)] - table.time[at[:-1]]) * 1e-9
-    true = np.diff(velocity, axis=0) + np.array((0.0, 0.0, _G)) * lasted[:, None]
-    middle = pose[:-1]
-    conjugate = middle * (1, -1, -1, -1)
-    speed = turned(conjugate, gained - true)
-    turn = _turns(table, at, step) - _between(pose[:-1], pose[1:])
-    sound = there[:-1] & there[1:] & known[at[:-1].clip(max=len(known) - 1)]
+    lasted = (edges[size:] - edges[:-size]) * 1e-9
+    gained = total[at[size:]] - total[at[:-size]]
+    true = velocity[size:] - velocity[:-size] + np.array((0.0, 0.0, _G)) * lasted[:, None]
+    speed = turned(pose[:-size] * (1, -1, -1, -1), gained - true)
+    first, last = _rotation(pose[:-size]), _rotation(pose[size:])
+    pieces = _turns(table, at, step)
+    whole = pieces[: len(first)]
+    for i in range(1, size):
+        whole = whole * pieces[i : i + len(first)]
+    turn = ((first.inv() * last).inv() * whole).as_rotvec()
+    sound = there[:-size] & there[size:] & known[at[:-size].clip(max=len(known) - 1)]
     return turn[sound], speed[sound]
 
 
@@ -191,24 +199,17 @@ def _velocity(track: Track, at: Stamps) -> Floats:
     return (ahead - behind) / 0.1
 
 
-def _turns(table: Table, at: np.ndarray, step: Floats) -> Floats:
-    """Rotation vectors between samples ``at``, by the gyro."""
-    from scipy.spatial.transform import Rotation
-
+def _turns(table: Table, at: np.ndarray, step: Floats) -> Any:
+    """Rotations between neighbouring samples ``at``, by the gyro."""
     found = []
-    for a, b in zip(at[:-1], at[1:], strict=True):
+    for a, b in pairwise(at):
         whole = Rotation.identity()
-        pieces = Rotation.from_rotvec(table.values[a:b, :3] * step[a:b, None])
-        for piece in pieces:
+        for piece in Rotation.from_rotvec(table.values[a:b, :3] * step[a:b, None]):
             whole = whole * piece
-        found.append(whole.as_rotvec())
-    return np.array(found)
+        found.append(whole.as_quat())
+    return Rotation.from_quat(np.array(found))
 
 
-def _between(a: Floats, b: Floats) -> Floats:
-    """Rotation vectors [T, 3] from attitude a to b (wxyz), in a's body frame."""
-    from scipy.spatial.transform import Rotation
-
-    first, second = (Rotation.from_quat(np.roll(q, -1, 1)) for q in (a, b))
-    turn: Floats = (first.inv() * second).as_rotvec()
-    return turn
+def _rotation(attitude: Floats) -> Any:
+    """Attitudes [T, 4] wxyz as scipy has them."""
+    return Rotation.from_quat(np.roll(attitude, -1, 1))

@@ -10,6 +10,7 @@ from coloc_env.datasets.residuals import robust
 MEMORY = 1.0  # s over which a filter averages what it measures
 CLIP = 3.0  # robust deviations: what is beyond is a filter's screen's to deal with
 _LEAST = 1e-4
+_OF_MEDIAN = (np.pi / 2) ** 0.5  # standard error of a median, in those of a mean
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,6 @@ class Noise:
     std: float
     tail: float
     white: float
-
-    @property
-    def standard_error(self) -> float:
-        """Of the median (of correlated errors: as if there were fewer)."""
-        return 1.2533 * self.white / max(1, self.count) ** 0.5
 
 
 def noise_of(time: Stamps, error: Floats) -> Noise:
@@ -55,11 +51,13 @@ def whitened(time: Stamps, error: Floats) -> float:
 
 def shrunk(parts: list[Noise]) -> list[float]:
     """Biases of several links, each drawn to their common one as far as it is uncertain (empirical
-    Bayes: τ² between links against each one's standard error)."""
+    Bayes: τ² between links against each one's standard error, from the noise of all of them, since
+    a few errors say little of their own)."""
     values = np.array([part.bias for part in parts])
-    error = np.array([part.standard_error for part in parts])
-    common = float(np.average(values, weights=1 / (error**2 + _LEAST**2)))
-    between = max(0.0, float(((values - common) ** 2).mean() - (error**2).mean()))
+    count = np.array([part.count for part in parts])
+    error = _OF_MEDIAN * pooled(parts, "white") / np.sqrt(count)
+    common = float(np.average(values, weights=count))
+    between = max(0.0, float(np.average((values - common) ** 2 - error**2, weights=count)))
     share = between / (between + error**2 + _LEAST**2)
     return (common + share * (values - common)).tolist()
 

@@ -8,12 +8,12 @@ from scipy.optimize import least_squares
 
 from coloc_env.datasets.noise_model import RangeModel
 from coloc_env.datasets.recording import Floats, Recording
-from coloc_env.datasets.residuals import Link, tag_at
+from coloc_env.datasets.residuals import Link, pose_at, tag_at, turned
 from training.calibration.ranges import less_systematic
 
 _PRIOR = 0.1  # m, by which a surveyed place may be off
 _FEW = 30  # ranges that a place is refined by
-_BETTER = 0.95  # of the error on ranges that were not used: what is not better is left alone
+_BETTER = 0.8  # of the error on ranges that were not used: what is not better is left alone
 _HUBER = 0.2  # m
 
 
@@ -27,7 +27,9 @@ def refined_anchors(recording: Recording, model: RangeModel) -> dict[str, tuple[
             continue
         ends = [tag_at(recording, link.robot, link.tags[:, 0], link.time) for link in own]
         tags = np.concatenate([place[known] for place, known in ends])
-        ranges = np.concatenate([k.measured[known] for k, (_, known) in zip(own, ends, strict=True)])
+        ranges = np.concatenate(
+            [k.measured[known] for k, (_, known) in zip(own, ends, strict=True)]
+        )
         time = np.concatenate([k.time[known] for k, (_, known) in zip(own, ends, strict=True)])
 
         def off(place: Floats, tags: Floats = tags, ranges: Floats = ranges) -> Floats:
@@ -61,8 +63,6 @@ def refined_arms(
 
 
 def _arm(bare: Recording, own: list[Link], tag: int, arm: Floats) -> Floats | None:
-    from coloc_env.datasets.residuals import pose_at, turned
-
     mine = [(link, link.tags[:, 0] == tag) for link in own]
     time = np.concatenate([link.time[there] for link, there in mine])
     ranges = np.concatenate([link.measured[there] for link, there in mine])

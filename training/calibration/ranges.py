@@ -13,7 +13,9 @@ _FEW = 3  # ranges of a link that say anything
 _OWN = 0.8  # of the deviation with the others' delay: what is less shows that a link has its own
 
 
-def calibrate_ranges(recording: Recording, stream: str) -> tuple[RangeModel, dict[str, Noise]] | None:
+def calibrate_ranges(
+    recording: Recording, stream: str
+) -> tuple[RangeModel, dict[str, Noise]] | None:
     """The noise model of a stream of ranges and what is known of each link; None where there is
     nothing to learn from."""
     links = [link for link in links_of(recording, stream) if _has_truth(recording, link)]

@@ -3,14 +3,17 @@
 import numpy as np
 
 from coloc_env.datasets.noise_model import BearingModel, SightingBias
-from coloc_env.datasets.recording import Recording
-from coloc_env.datasets.residuals import sighting_residuals
+from coloc_env.datasets.recording import Flags, Recording, Stamps
+from coloc_env.datasets.residuals import pose_at, sighting_residuals
 from training.calibration.noise import Noise, noise_of, pooled, shrunk
 
 _FEW = 10
+_STEP = 100_000_000  # ns
 
 
-def calibrate_sightings(recording: Recording, stream: str) -> tuple[BearingModel, dict[str, Noise]] | None:
+def calibrate_sightings(
+    recording: Recording, stream: str
+) -> tuple[BearingModel, dict[str, Noise]] | None:
     """The model of a stream of range and bearing, of each robot's camera; None without truth."""
     ranges: dict[str, Noise] = {}
     bearings: dict[str, Noise] = {}
@@ -41,18 +44,23 @@ def calibrate_sightings(recording: Recording, stream: str) -> tuple[BearingModel
 
 def calibrate_heights(recording: Recording) -> Noise | None:
     """Heights against truth, of all robots together."""
-    from coloc_env.datasets.residuals import pose_at
-
     times, errors = [], []
     for robot, table in enumerate(recording.streams["height"]):
         track = recording.truth[robot]
         if len(table.time) and len(track.time) > 1:
             position, _, known = pose_at(track, table.time)
-            times.append(table.time[known])
-            errors.append((table.values[:, 0] - position[:, 2])[known])
+            used = known & _newest(table.time)
+            times.append(table.time[used])
+            errors.append((table.values[:, 0] - position[:, 2])[used])
     parts = [noise_of(t, e) for t, e in zip(times, errors, strict=True) if len(t) >= _FEW]
     if not parts:
         return None
     whole = np.concatenate(errors)
     bias = float(np.median(whole))
     return Noise(len(whole), bias, pooled(parts, "std"), 0.0, pooled(parts, "white"))
+
+
+def _newest(time: Stamps) -> Flags:
+    """The last sample of each step of 0.1 s: what a filter is given."""
+    step = (time - time[0]) // _STEP
+    return np.append(np.diff(step) > 0, True)

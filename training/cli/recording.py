@@ -83,16 +83,18 @@ def check(
     typer.echo(f"{found.name}: {team}, {', '.join(kinds)}")
     show(
         ["robot", "stream", "samples", "rate, Hz", "longest gap, s", "gaps", "same stamp"],
-        [
-            [row.robot, row.stream, *_timing(row)] for row in report.streams
-        ],
+        [[row.robot, row.stream, *_timing(row)] for row in report.streams],
     )
     if report.links:
         typer.echo("ranges less the truth")
         show(
             ["link", "samples", "bias, m", "σ, m", "beyond 3 σ", "late by, s"],
             [
-                [row.link, *_noise(row.samples, row.bias, row.std, row.outliers), f"{row.delay:+.2f}"]
+                [
+                    row.link,
+                    *_noise(row.samples, row.bias, row.std, row.outliers),
+                    f"{row.delay:+.2f}",
+                ]
                 for row in report.links
             ],
         )

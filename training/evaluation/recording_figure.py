@@ -34,7 +34,8 @@ def draw_recording(recording: Recording, path: Path) -> None:
 
 def _timeline(axes: Axes, recording: Recording) -> None:
     """A line a stream, a mark a sample: gaps are what is not marked."""
-    colours, zero, names = uav_colours(len(recording.robots)), span_of(recording)[0], []
+    colours, zero = uav_colours(len(recording.robots)), span_of(recording)[0]
+    names: list[str] = []
     for i, robot in enumerate(recording.robots):
         tables: dict[str, Table | Track] = {"truth": recording.truth[i]}
         tables |= {stream: team[i] for stream, team in recording.streams.items()}

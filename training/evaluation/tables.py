@@ -93,10 +93,8 @@ def innovation_rows(results: Evaluation) -> list[list[str]]:
             band = [short(figures.get(f"nis_{sensor}_{end}")) for end in ("low", "high")]
             band = band if sensor else ["–"]
             white = short(figures.get(f"whiteness_{sensor}_band"))
-            lines.append(
-                [name, sensor or "–", short(own["nis"]), " to ".join(band)]
-                + [short(own["whiteness"]), f"± {white}", short(own["rejected"]), *ends]
-            )
+            shown = (short(own["nis"]), " to ".join(band), short(own["whiteness"]), f"± {white}")
+            lines.append([name, sensor or "–", *shown, short(own["rejected"]), *ends])
     return lines
 
 

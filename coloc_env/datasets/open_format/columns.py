@@ -65,7 +65,7 @@ class Columns:
             time=self.time[chosen],
             numbers={name: values[chosen] for name, values in self.numbers.items()},
             names={name: [values[i] for i in index] for name, values in self.names.items()},
-            lines=[self.lines[i] for i in index],
+            lines=[self.lines[int(i)] for i in index],
         )
 
 

@@ -140,12 +140,10 @@ def _tags(file: YamlFile, robots: tuple[str, ...], dim: int, length: float) -> F
             file.fail(("tags", robot), "is not a list of lever arms, as in [[0.1, 0, 0]]")
         arms.append([file.vector("tags", robot, i, size=dim) for i in range(len(given or []))])
     most = max(map(len, arms))
-    if most and not file.mapping("tags"):
-        most = 0
     table = np.full((len(robots), most, dim), np.nan)
-    for robot, own in enumerate(arms):
+    for i, own in enumerate(arms):
         if own:
-            table[robot, : len(own)] = np.array(own) * length
+            table[i, : len(own)] = np.array(own) * length
     return table
 
 

@@ -14,7 +14,7 @@ from coloc_env.datasets.open_format.columns import Columns, Kind, read_columns
 from coloc_env.datasets.open_format.description import FILE, Description, read_description
 from coloc_env.datasets.open_format.frames import world
 from coloc_env.datasets.open_format.truth import marked_points, read_truth
-from coloc_env.datasets.recording import DataError, Recording, Table, Track, near_origin
+from coloc_env.datasets.recording import DataError, Recording, Stamps, Table, Track, near_origin
 from coloc_env.options import unknown
 
 TABLES = (".csv", ".parquet")
@@ -79,7 +79,7 @@ def read_recording(folder: str | os.PathLike[str]) -> Recording:
         points=points,
         start=streams.start_in_world(about),
     )
-    if not any(len(t.time) for t in (*recording.truth, *_tables(recording))):
+    if not any(len(time) for time in _times(recording)):
         raise DataError(f"{folder}: no file holds a sample")
     return near_origin(_from_earliest(recording) if about.epoch else recording)
 
@@ -115,15 +115,17 @@ def _require_known(folder: Path, about: Description) -> None:
                 raise DataError(f"{path}: {unknown('table', path.stem, KNOWN)}")
 
 
-def _tables(recording: Recording) -> list[Table]:
-    """Every table of a recording, points included."""
-    return [table for team in recording.streams.values() for table in team] + [*recording.points]
+def _times(recording: Recording) -> list[Stamps]:
+    """The times of everything, truth and points included."""
+    tables = [table for team in recording.streams.values() for table in team]
+    return [each.time for each in (*tables, *recording.points)] + [
+        track.time for track in recording.truth
+    ]
 
 
 def _from_earliest(recording: Recording) -> Recording:
     """Times since the earliest stamp, which ``epoch`` says."""
-    every = [*recording.truth, *_tables(recording)]
-    zero = min(int(each.time[0]) for each in every if len(each.time))
+    zero = min(int(time[0]) for time in _times(recording) if len(time))
 
     def shift(table: Table) -> Table:
         return replace(table, time=table.time - zero)

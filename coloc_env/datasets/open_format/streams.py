@@ -116,11 +116,12 @@ def _ranges(found: Columns, about: Description) -> Made:
         there = among & good
         if name == "uav_ranges":
             columns: tuple[str, ...] = ("own_tag", "robot", "tag", "range")
-            parts = (tags[0], to, tags[1], distance)
+            values = np.column_stack((tags[0], to, tags[1], distance))
         else:
-            columns, parts = ("own_tag", "anchor", "range"), (tags[0], to - robots, distance)
+            columns = ("own_tag", "anchor", "range")
+            values = np.column_stack((tags[0], to - robots, distance))
         if among.any():
-            table = Table(found.time[there], np.stack(parts, 1)[there].astype(float), columns)
+            table = Table(found.time[there], values[there], columns)
             made[name] = (table, int((among & ~good).sum()))
     return made
 
@@ -214,7 +215,7 @@ def _height(found: Columns, about: Description) -> Made:
     if about.dim == 2:
         raise DataError(f"{found.path}: a height is for 3 dimensions")
     sign = -1.0 if about.frame == "ned" and "z" in found else 1.0
-    height = sign * found.require("z" if "z" in found else "height") * about.length
+    height: Floats = sign * about.length * found.require("z" if "z" in found else "height")
     good = np.abs(height[:, 0]) <= FARTHEST
     return {"height": (Table(found.time[good], height[good], ("height",)), int((~good).sum()))}
 
@@ -292,7 +293,7 @@ FILES: dict[str, _File] = {
     "imu": _File(_kinds("number", *IMU_COLUMNS), _imu),
     "odometry": _File(_kinds("number", "v", "omega", "vx", "vy", "wz"), _odometry),
     "ranges": _File(
-        {"to": "name"} | _kinds("measured", "range") | _kinds("number", "own_tag", "to_tag"),
+        _kinds("name", "to") | _kinds("measured", "range") | _kinds("number", "own_tag", "to_tag"),
         _ranges,
     ),
     "sightings": _File(
@@ -303,7 +304,7 @@ FILES: dict[str, _File] = {
     "position_fix": _File(_kinds("measured", *AXES), _fixes),
     "magnetometer": _File(_kinds("number", *AXES), _magnetometer),
     "relative_pose": _File(
-        {"robot": "name"} | _kinds("number", *AXES, *QUATERNION, "heading"), _poses
+        _kinds("name", "robot") | _kinds("number", *AXES, *QUATERNION, "heading"), _poses
     ),
 }
 ORDER = (

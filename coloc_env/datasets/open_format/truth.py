@@ -11,6 +11,7 @@ from coloc_env.datasets.open_format.description import Description
 from coloc_env.datasets.recording import (
     FARTHEST,
     DataError,
+    Flags,
     Floats,
     Stamps,
     Table,
@@ -38,15 +39,14 @@ def read_truth(path: Path, about: Description, read: Read) -> Track:
     dim = about.dim
     axes = AXES[:dim]
     groups = {name: columns[: dim if name == "velocity" else 3] for name, columns in GROUPS.items()}
-    known: dict[str, Kind] = dict.fromkeys(axes, "number")
-    known |= dict.fromkeys(("heading", *(QUATERNION if dim == 3 else QUATERNION[2:])), "number")
-    for columns in groups.values():
-        known |= dict.fromkeys(columns, "number")
+    turns = QUATERNION if dim == 3 else QUATERNION[2:]
+    whole = (*axes, "heading", *turns, *(c for columns in groups.values() for c in columns))
+    known: dict[str, Kind] = dict.fromkeys(whole, "number")
     found = _first_of_each(read(path, known))
     if not len(found):
         raise DataError(f"{path}: no data")
     position = frames.world(found.require(*axes) * about.length, about.frame)
-    far = (np.abs(position) > FARTHEST).any(1)
+    far: Flags = (np.abs(position) > FARTHEST).any(1)
     if far.any():
         found.fail(far, axes[0], f"is no place within {FARTHEST:g} m of the origin")
     parts = {name: _group(found, columns) for name, columns in groups.items()}
@@ -66,7 +66,8 @@ def marked_points(path: Path | None, about: Description, read: Read) -> tuple[Ta
     if path is None:
         return ()
     axes = AXES[: about.dim]
-    found = read(path, {"robot": "name"} | dict.fromkeys(axes, "number"))
+    known: dict[str, Kind] = {"robot": "name", **dict.fromkeys(axes, "number")}
+    found = read(path, known)
     places = frames.world(found.require(*axes) * about.length, about.frame)
     owner = indices(found, "robot", about.robots)
     tables = []

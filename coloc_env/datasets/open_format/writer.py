@@ -147,7 +147,7 @@ def _columns(recording: Recording, stream: str, table: Table) -> dict[str, Colum
     return found
 
 
-def _named(names: tuple[str, ...], index: Floats) -> list[str]:
+def _named(names: tuple[str, ...], index: np.ndarray) -> list[str]:
     return [names[int(i)] for i in index]
 
 

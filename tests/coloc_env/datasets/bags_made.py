@@ -78,8 +78,13 @@ def _messages(store: Any, first: bool) -> Any:
     for i, row in enumerate(made["imu"]):
         time = START + 10_000_000 * i
         late = time - 15_000_000 * (i % 10 == 5)  # written after one that was measured later
-        yield "/a/imu", "sensor_msgs/msg/Imu", time, t["sensor_msgs/msg/Imu"](
-            header(late), level, nine, vector(*row[:3]), nine, vector(*row[3:]), nine
+        yield (
+            "/a/imu",
+            "sensor_msgs/msg/Imu",
+            time,
+            t["sensor_msgs/msg/Imu"](
+                header(late), level, nine, vector(*row[:3]), nine, vector(*row[3:]), nine
+            ),
         )
     pose = t["geometry_msgs/msg/Pose"]
     for i, (place, twist) in enumerate(zip(made["pose"], made["twist"], strict=True)):
@@ -89,19 +94,29 @@ def _messages(store: Any, first: bool) -> Any:
         rate = t["geometry_msgs/msg/Twist"](
             vector(twist[0], twist[1], 0.0), vector(0.0, 0.0, twist[2])
         )
-        yield "/b/odom", "nav_msgs/msg/Odometry", time, t["nav_msgs/msg/Odometry"](
-            header(time),
-            "base",
-            t["geometry_msgs/msg/PoseWithCovariance"](pose(point(*place), level), wide),
-            t["geometry_msgs/msg/TwistWithCovariance"](rate, wide),
+        yield (
+            "/b/odom",
+            "nav_msgs/msg/Odometry",
+            time,
+            t["nav_msgs/msg/Odometry"](
+                header(time),
+                "base",
+                t["geometry_msgs/msg/PoseWithCovariance"](pose(point(*place), level), wide),
+                t["geometry_msgs/msg/TwistWithCovariance"](rate, wide),
+            ),
         )
         exchange = t["my_uwb/msg/Exchange"]
-        yield "/a/uwb", "my_uwb/msg/Ranging", time, t["my_uwb/msg/Ranging"](
-            header(time),
-            [
-                exchange(responder=7 + k, antenna=k % 2, distance_mm=int(d), valid=k < 2)
-                for k, d in enumerate(made["distance"][i])
-            ],
+        yield (
+            "/a/uwb",
+            "my_uwb/msg/Ranging",
+            time,
+            t["my_uwb/msg/Ranging"](
+                header(time),
+                [
+                    exchange(responder=7 + k, antenna=k % 2, distance_mm=int(d), valid=k < 2)
+                    for k, d in enumerate(made["distance"][i])
+                ],
+            ),
         )
     for i, height in enumerate(made["height"]):
         time = START + 60_000_000 * i
@@ -110,8 +125,13 @@ def _messages(store: Any, first: bool) -> Any:
         yield "/a/laser", "sensor_msgs/msg/Range", time, t["sensor_msgs/msg/Range"](*fields, *more)
     for i, fix in enumerate(made["fix"]):
         time = START + 80_000_000 * i
-        yield "/b/gps", "sensor_msgs/msg/NavSatFix", time, t["sensor_msgs/msg/NavSatFix"](
-            header(time), t["sensor_msgs/msg/NavSatStatus"](status=0, service=1), *fix, nine, 0
+        yield (
+            "/b/gps",
+            "sensor_msgs/msg/NavSatFix",
+            time,
+            t["sensor_msgs/msg/NavSatFix"](
+                header(time), t["sensor_msgs/msg/NavSatStatus"](status=0, service=1), *fix, nine, 0
+            ),
         )
 
 

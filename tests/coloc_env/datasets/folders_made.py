@@ -1,4 +1,4 @@
-"""Small recordings in the open format, as people would make them, and a slow plain reader of them."""
+"""Small recordings in the open format, as people would make them, and a plain reader of them."""
 
 import csv
 from decimal import Decimal
