@@ -120,8 +120,8 @@ def calibrate_imu(recording: Recording) -> ImuModel | None:
     return ImuModel(
         accel_std=root(accel_noise),
         gyro_std=root(gyro_noise),
-        accel_bias=max(accel_left, 1e-3),
-        gyro_bias=max(gyro_left, 1e-5),
+        accel_bias=max(accel_left, defaults.accel_bias),
+        gyro_bias=max(gyro_left, defaults.gyro_bias),
         robots=biases,
     )
 

@@ -56,7 +56,7 @@ def shrunk(parts: list[Noise]) -> list[float]:
     values = np.array([part.bias for part in parts])
     count = np.array([part.count for part in parts])
     error = _OF_MEDIAN * pooled(parts, "white") / np.sqrt(count)
-    common = float(np.average(values, weights=count))
+    common = float(np.median(values))
     between = max(0.0, float(np.average((values - common) ** 2 - error**2, weights=count)))
     share = between / (between + error**2 + _LEAST**2)
     return (common + share * (values - common)).tolist()
