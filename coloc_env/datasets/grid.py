@@ -74,13 +74,13 @@ def aligned(grid: Grid, recording: Recording, streams: tuple[str, ...]) -> Grid:
     period = round(grid.dt * 1e9)
     time = np.concatenate([table.time for table in tables])
     pairs = [_links(recording, name) for name in streams if name in _LINKS]
-    best, least = 0, (np.inf, np.inf)
-    for offset in (np.arange(_PHASES) * period) // _PHASES:
+    best, least = 0, (len(time), np.inf)
+    for offset in (i * period // _PHASES for i in range(_PHASES)):
         late = time - grid.start - offset
         age = float((-late % period).mean())
         twice = sum(_repeats(_delivered(grid, offset, each), link) for each, link in pairs)
         if (twice, age) < least:
-            best, least = int(offset), (twice, age)
+            best, least = offset, (twice, age)
     return Grid(grid.start + best, grid.dt, grid.count - (best > 0))
 
 
@@ -90,7 +90,7 @@ def _delivered(grid: Grid, offset: int, time: Stamps) -> NDArray[np.int64]:
 
 
 def _links(recording: Recording, stream: str) -> tuple[Stamps, NDArray[np.int64]]:
-    """Times and links of all of a stream's measurements: two of one link must not meet in a step."""
+    """Times and links of all measurements of a stream: two of one link must not share a step."""
     tables = recording.streams[stream]
     ends = [table.values[:, : _LINKS[stream]].astype(np.int64) for table in tables]
     owner = np.repeat(np.arange(len(tables)), [len(each) for each in ends])

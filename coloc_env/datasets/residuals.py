@@ -3,7 +3,7 @@
 Truth is interpolated between its samples, and only where they are at most 0.25 s apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table, Track
 
 _HOLE = 250_000_000  # ns between samples of truth that are bridged
-_MANY = 50  # ranges, of fewer of which no delay is told
+_FEW, _MANY = 20, 100  # ranges of a link, and of all, of fewer of which no delay is told
+_CHANGE = 1_000_000_000  # ns over which errors are watched change
+_FALLS = 0.95  # of a deviation: what a delay must make of it
 _LATEST = 600_000_000  # ns, the largest delay that is looked for
 
 
@@ -128,16 +130,28 @@ def robust(values: Floats) -> tuple[float, float]:
 
 def best_delay(recording: Recording, links: Sequence[Link]) -> float:
     """The delay (s) with which ranges of some links fit the truth best: the least robust deviation,
-    all links' together. 0 where the motion shows nothing of it: the deviation must fall by a tenth.
+    all links' together; 0 where the motion shows nothing of it (it must fall by a twentieth).
+
+    Biases that last, or grow with the distance, are not to pass for a delay. So what is looked at
+    is how much errors change in a second or, where that shows nothing, errors about a line over the
+    distance.
     """
+    return next(filter(None, (_least(recording, links, look) for look in (changes, spread))), 0.0)
+
+
+def _least(
+    recording: Recording, links: Sequence[Link], look: Callable[[Recording, Link, float], float]
+) -> float:
+    """The delay of the least deviation, or 0."""
     delays = np.arange(-_LATEST, _LATEST + 1, 20_000_000) * 1e-9
-    curves = [[spread(recording, link, delay) for delay in delays] for link in links]
-    known = np.array([curve for curve in curves if not np.isnan(curve).any()])
-    if not len(known):
+    curves = np.array([[look(recording, link, delay) for delay in delays] for link in links])
+    count = np.array([len(link.time) for link in links])
+    known = ~np.isnan(curves).any(1) if len(links) else np.zeros(0, bool)
+    if count[known].sum() < _MANY:
         return 0.0
-    whole = np.log(np.maximum(known, 1e-4)).mean(0)
+    whole = np.average(np.log(np.maximum(curves[known], 1e-4)), axis=0, weights=count[known])
     best = int(np.argmin(whole))
-    if not 0 < best < len(delays) - 1 or whole[best] > whole[len(delays) // 2] + np.log(0.9):
+    if not 0 < best < len(delays) - 1 or whole[best] > whole[len(delays) // 2] + np.log(_FALLS):
         return 0.0
     left, middle, right = whole[best - 1 : best + 2]
     bend = left - 2 * middle + right
@@ -145,18 +159,30 @@ def best_delay(recording: Recording, links: Sequence[Link]) -> float:
     return float(np.round(delays[best] + 0.02 * shift, 3))
 
 
+def changes(recording: Recording, link: Link, delay: float) -> float:
+    """The robust deviation (m) of how much the errors of a link's ranges, ``delay`` s late, change
+    in a second; NaN where there are too few."""
+    distance, known = true_ranges(recording, link, delay)
+    time, error = link.time[known], (link.measured - distance)[known]
+    later = np.searchsorted(time, time + _CHANGE)
+    there = later < len(time)
+    there[there] &= time[later[there]] - time[there] < 2 * _CHANGE
+    if there.sum() < _FEW:
+        return float("nan")
+    return robust(error[later[there]] - error[there])[1]
+
+
 def spread(recording: Recording, link: Link, delay: float) -> float:
     """The robust deviation (m) of a link's ranges ``delay`` s late about a line over the distance;
     NaN where there are too few."""
     distance, known = true_ranges(recording, link, delay)
-    if known.sum() < _MANY:
+    if known.sum() < _FEW:
         return float("nan")
     return robust(_detrended(distance[known], (link.measured - distance)[known]))[1]
 
 
 def _detrended(distance: Floats, error: Floats) -> Floats:
-    """Errors less a line over the distance, by reweighted least squares: a bias that grows with the
-    distance is not to pass for a delay."""
+    """Errors less a line over the distance, by reweighted least squares."""
     x = distance - np.median(distance)
     rest, weight = error, np.ones(len(error))
     for _ in range(4):

@@ -11,8 +11,8 @@ from training.calibration.inertial import calibrate_imu
 from training.calibration.noise import Noise
 from training.calibration.places import refined_anchors, refined_arms
 from training.calibration.ranges import calibrate_ranges
-from training.calibration.smoother import smoothed
 from training.calibration.sightings import calibrate_heights, calibrate_sightings
+from training.calibration.smoother import smoothed
 from training.calibration.wheels import calibrate_odometry
 
 _DT = 0.1  # s, of the steps over which speeds are believed in

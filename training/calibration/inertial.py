@@ -189,6 +189,8 @@ def _increments(table: Table, track: Track, edges: Stamps, size: int) -> tuple[F
     for i in range(1, size):
         whole = whole * pieces[i : i + len(first)]
     turn = ((first.inv() * last).inv() * whole).as_rotvec()
+    back = ((first.inv() * last) ** 0.5).inv()  # to the frame in the middle, where biases are meant
+    turn, speed = back.inv().apply(turn), back.apply(speed)
     sound = there[:-size] & there[size:] & known[at[:-size].clip(max=len(known) - 1)]
     return turn[sound], speed[sound]
 

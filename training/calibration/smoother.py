@@ -151,8 +151,8 @@ def _initial(recording: Recording, grid: Grid, at: _Unknowns) -> Floats:
     """Everybody from the start that is given, or from amid the map, along the anchor ranges;
     headings by odometry alone."""
     x = np.zeros(at.size)
-    places = np.concatenate([p for p in (recording.anchors, recording.landmarks) if len(p)] or [[]])
-    middle = places.mean(0) if places.size else np.zeros(at.dim)
+    places = np.concatenate((recording.anchors, recording.landmarks))
+    middle = places.mean(0) if len(places) else np.zeros(at.dim)
     knots = np.arange(at.knots)
     for robot in range(at.robots):
         place, heading = middle, 0.0
@@ -195,9 +195,7 @@ def _walked(recording: Recording, grid: Grid, robot: int, place: Floats) -> Floa
 # ------------------------------------------------------------------ factors
 
 
-def _factors(
-    recording: Recording, model: NoiseModel, grid: Grid, at: _Unknowns, x: Floats
-) -> Rows:
+def _factors(recording: Recording, model: NoiseModel, grid: Grid, at: _Unknowns, x: Floats) -> Rows:
     """All residuals at ``x``."""
     found: Rows = []
     for robot in range(at.robots):
@@ -224,7 +222,9 @@ def _factors(
             ("position_fix", 0, model.position_fix.std),
         ):
             if stream in recording.streams:
-                found += _coordinates(recording.streams[stream][robot], grid, at, robot, x, first, std)
+                found += _coordinates(
+                    recording.streams[stream][robot], grid, at, robot, x, first, std
+                )
     return [each for each in found if len(each.residual)]
 
 

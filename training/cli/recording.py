@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.cli.options import Data
+from training.cli.options import Data, Settings
 from training.cli.terminal import progress, show
 
 if TYPE_CHECKING:
@@ -183,6 +183,13 @@ def calibrate(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="What to write; DIR/believed.yaml if none.")
     ] = None,
+    tune: Annotated[
+        str | None,
+        typer.Option(
+            metavar="AGENT", help="Scale noise to what this agent does best with on the part."
+        ),
+    ] = None,
+    settings: Settings = None,
 ) -> None:
     """Learn what a recording's sensors are like: noise, biases, delays, places and scales.
 
@@ -192,6 +199,8 @@ def calibrate(
     **Examples**
 
     coloc recording calibrate flight --span 0:60
+
+    coloc recording calibrate flight --span 0:60 --tune ekf:robust=huber
 
     coloc evaluate replay-v0 --set path=flight --set believed=flight/believed.yaml
     --set span=60:180 --agents ekf --out results/flight
@@ -211,12 +220,25 @@ def calibrate(
         for name, n in learnt.noises.items()
     ]
     show(["", "samples", "bias", "σ", "beyond 3 σ", "σ if white"], lines)
-    for note in learnt.notes:
+    model, notes = learnt.model, learnt.notes
+    if tune is not None:
+        from coloc_env.scenarios import parse_override
+        from training.calibration.tune import tuned
+
+        if not found.tracked:
+            raise ValueError("--tune needs ground truth")
+        chosen = dict(parse_override("replay-v0", text) for text in settings or ())
+        if span is not None:
+            chosen["span"] = _span(span)
+        with progress() as bars:
+            model, words = tuned(model, folder, tune, bars, **chosen)
+        notes = (*notes, *words)
+    for note in notes:
         typer.echo(note)
     path = folder / "believed.yaml" if out is None else out
     part = "all of it" if span is None else f"{span} s of it"
     with staged_file(path) as file:
-        text = write_noise_model(learnt.model, f"{found.name}: calibrated on {part}")
+        text = write_noise_model(model, f"{found.name}: calibrated on {part}")
         file.write_text(text, encoding="utf-8")
     typer.echo(f"written to {path}")
 

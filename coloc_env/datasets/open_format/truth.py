@@ -46,7 +46,7 @@ def read_truth(path: Path, about: Description, read: Read) -> Track:
     if not len(found):
         raise DataError(f"{path}: no data")
     position = frames.world(found.require(*axes) * about.length, about.frame)
-    far: Flags = (np.abs(position) > FARTHEST).any(1)
+    far: Flags = np.abs(position).max(1) > FARTHEST
     if far.any():
         found.fail(far, axes[0], f"is no place within {FARTHEST:g} m of the origin")
     parts = {name: _group(found, columns) for name, columns in groups.items()}

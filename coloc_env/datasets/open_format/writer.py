@@ -12,7 +12,7 @@ from coloc_env.datasets.open_format.description import FILE
 from coloc_env.datasets.open_format.reader import POINTS
 from coloc_env.datasets.open_format.streams import stream_files
 from coloc_env.datasets.open_format.truth import AXES, GROUPS, QUATERNION
-from coloc_env.datasets.recording import DataError, Floats, Recording, Stamps, Table, Track
+from coloc_env.datasets.recording import DataError, Recording, Stamps, Table, Track
 from coloc_env.staging import staged_folder
 
 Column = Sequence[Any]

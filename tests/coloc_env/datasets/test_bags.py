@@ -67,8 +67,16 @@ def test_a_first_topics_file_is_one(bag: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("/a/imu", "/a/imus", r"line 8: robots.a.imu: unknown topic '/a/imus' \(did you mean '/a/im"),
-        ("distance_mm", "range", "no field 'range' in 'range'; known: responder, antenna, distance_m"),
+        (
+            "/a/imu",
+            "/a/imus",
+            r"line 8: robots.a.imu: unknown topic '/a/imus' \(did you mean '/a/im",
+        ),
+        (
+            "distance_mm",
+            "range",
+            "no field 'range' in 'range'; known: responder, antenna, distance_m",
+        ),
         ("exchanges", "header", "'header' is no list"),
         ("{topic: /a/laser}", "{topic: /a/uwb}", "my_uwb/msg/Ranging says nothing of height; name"),
         ("'8': eight", "'8': ate", "ranges.csv, line 3, column to: 'ate' is none of a, b, seven"),
@@ -76,7 +84,7 @@ def test_a_first_topics_file_is_one(bag: Path, tmp_path: Path) -> None:
         ("each", "every", "unknown entry 'every'"),
         ("dim: 3", "dim: 4", "dim: 4 is not 2 or 3"),
     ],
-)  # fmt: skip
+)
 def test_wrong_topics_are_named(old: str, new: str, words: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "flight", "mcap")
     path = tmp_path / "topics.yaml"

@@ -162,13 +162,16 @@ def test_streams_that_nobody_uses_are_named(tmp_path: Path) -> None:
         ({"path": "/nowhere"}, "/nowhere: no such folder"),
         ({"process": "inertial"}, "process=inertial needs imu of every robot in 3 dim"),
         ({"believed": "anchor_range: {}"}, "unknown entry 'anchor_range' .did you mean 'anchor_ra"),
-        ({"believed": "anchor_ranges: {std: -1}"}, "line 1: anchor_ranges.std: -1 is not 0 or more"),
+        (
+            {"believed": "anchor_ranges: {std: -1}"},
+            "line 1: anchor_ranges.std: -1 is not 0 or more",
+        ),
         ({"believed": "anchor_ranges: {links: {a/b: {}}}"}, "unknown link 'a/b'"),
         ({"believed": "anchors: {x: [0, 0]}"}, "unknown anchor 'x'"),
         ({"believed": "anchors: {anchor_0: [0]}"}, "is not 2 finite numbers"),
         ({"span": (20.0, 30.0)}, "span=.* is not allowed"),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused(options: dict[str, Any], words: str, tmp_path: Path) -> None:
     write_recording(wheeled_team(), tmp_path / "circles")
     if options:
@@ -200,7 +203,9 @@ def test_three_dimensions_with_imu_run_without_truth(tmp_path: Path) -> None:
         truth=(Track.unknown(3),),
         streams={
             "imu": (
-                Table(time, imu.values, tuple(f"{s}_{x}" for s in ("gyro", "accel") for x in "xyz")),
+                Table(
+                    time, imu.values, tuple(f"{s}_{x}" for s in ("gyro", "accel") for x in "xyz")
+                ),
             ),
             "anchor_ranges": (ranges,),
         },
