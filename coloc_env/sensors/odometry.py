@@ -72,7 +72,7 @@ class Odometry(Sensor):
 
 @dataclass(frozen=True, eq=False)
 class RecordedOdometry(RecordedSensor):
-    """A recorded ``Odometry`` in the plane that may have a leaf beside it where samples are missing:
+    """A recorded ``Odometry`` in the plane that may have one more leaf where samples are missing:
 
     ``odometry_unknown`` [3]: what the mean over the step is off for want of samples, standard
     deviations forward, left (m/s) and of the turn (rad/s), beside those of ``Odometry.std``.
