@@ -125,6 +125,15 @@ ZEROS = {
 }
 
 
+@pytest.mark.parametrize("exact", ["accel_bias", "gyro_bias"])
+@pytest.mark.parametrize("name", ["ekf", "ekf_joint", "emvf", "pf500", "stein_vi"])
+def test_one_of_two_biases_may_be_exact(name: str, exact: str, tools: SimpleNamespace) -> None:
+    """Its variance of 0 would leave the prior's covariance without an inverse."""
+    scenario = make_scenario("indoor-v0", imu_bias=True, uwb=name != "stein_vi", **{exact: 0.0})
+    run = tools.play(tools.build(name, scenario), scenario, [0], 4)
+    assert run.position.isfinite().all()
+
+
 @pytest.mark.parametrize("zero", ZEROS)
 @pytest.mark.parametrize("name", ["ekf", "ekf_joint", "ekf_trust", "pf500", "apf", "pf_trust"])
 def test_a_world_without_noise_leaves_filters_sound(
