@@ -29,13 +29,6 @@ PERFECT = {
     "ins_bias": 0.0,
     "prior_std": 0.01,
 }
-    "anchors": 4,
-    "uwb": False,
-    "uwb_std": 1e-3,
-    "ins_std": 1e-3,
-    "ins_bias": 0.0,
-    "prior_std": 0.01,
-}
 USELESS = {"anchors": 0, "uwb": False, "ins_std": 1e6, "prior": "uniform"}
 
 
