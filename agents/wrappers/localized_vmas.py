@@ -19,13 +19,14 @@ def localized_vmas(
 
     ``scenario``: an instance that no environment has been made of; it is changed in place and
     returned. ``task.positions`` and ``task.entries`` are given the scenario. Observations must be
-    flat tensors. Infos have ``localization_error`` (m). The noise's seeds are drawn from torch's
-    generator, which VMAS seeds.
+    flat tensors. Infos have ``localization_error`` (m). The noise follows VMAS's seed, and draws
+    nothing from VMAS's random numbers: the task goes as it does without localization.
     """
     kind = type(scenario)
 
     class LocalizedScenario(kind):  # type: ignore[misc, valid-type]
         team: Localization | None = None
+        _episodes = 0
 
         def reset_world_at(self, env_index: int | None = None) -> None:
             super().reset_world_at(env_index)
@@ -34,7 +35,10 @@ def localized_vmas(
                 self.team = task.localization(localizer, places, **overrides)
             elif env_index is not None:
                 rows = torch.arange(len(places)) == env_index
-            self.team.restart(places, torch.randint(MOST, (len(places),)), rows)
+            with torch.random.fork_rng(devices=[]):
+                seeds = torch.randint(MOST, (len(places),))
+            self._episodes += 1
+            self.team.restart(places, (seeds + self._episodes) % MOST, rows)
 
         def post_step(self) -> None:
             super().post_step()
