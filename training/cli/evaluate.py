@@ -91,9 +91,10 @@ def evaluate(
 
 def _show(found: "Evaluation") -> None:
     """Print the table, and what went wrong."""
-    from training.evaluation.tables import COLUMNS, left_out, rows
+    from training.evaluation.tables import COLUMNS, heading, left_out, rows
 
     columns = {key: title for key, title in COLUMNS.items() if key not in _TOO_WIDE}
+    typer.echo(f"{heading(found)}; position errors in m")
     show(["", *columns.values()], rows(found, columns))
     if found.dropped:
         typer.echo(f"note: {left_out(found)}", err=True)
