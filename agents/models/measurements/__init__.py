@@ -3,7 +3,15 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, no_neighbours, received
+from agents.models.measurements.base import (
+    Block,
+    Measurement,
+    Neighbours,
+    no_neighbours,
+    noise_std,
+    received,
+    usable,
+)
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
@@ -43,7 +51,9 @@ __all__ = [
     "measures",
     "model_of",
     "no_neighbours",
+    "noise_std",
     "received",
+    "usable",
 ]
 
 _M = TypeVar("_M", bound=Callable[[Any], Measurement])
