@@ -1,7 +1,7 @@
 """Holes in what drives a motion model: a mean stands in, filters and the bound count what it is
 off, and nothing changes where there is no hole."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_filters_and_the_bound_know_of_a_hole(stream: str) -> None:
 def test_what_is_said_to_be_unknown_is_what_the_mean_is_off() -> None:
     """A speed that lasts for a second: over a hole of 3 s its sum is off by as much as is said."""
     rng, hold = np.random.default_rng(1), 50
-    grid, held = Grid(0, DT, STEPS + 1), 0.25
+    grid, held, made = Grid(0, DT, STEPS + 1), 0.25, recording("odometry", None)
     errors, stated = [], []
     for _ in range(400):
         time = np.arange(501) * 20_000_000
@@ -136,13 +136,11 @@ def test_what_is_said_to_be_unknown_is_what_the_mean_is_off() -> None:
         speed = np.roll(speed, rng.integers(hold))
         table = Table(time, np.stack((speed, 0 * speed), 1), ("v", "omega"))
         gap = (time * 1e-9 <= HOLE[0]) | (time * 1e-9 >= HOLE[1])
-        cut = SimpleNamespace(
-            streams={"odometry": (Table(time[gap], table.values[gap], table.columns),)}
+        cut = Table(time[gap], table.values[gap], table.columns)
+        whole, spoiled = (
+            recorded_odometry(replace(made, streams={"odometry": (one,)}), grid, Odometry(), held)
+            for one in (table, cut)
         )
-        whole = recorded_odometry(
-            SimpleNamespace(streams={"odometry": (table,)}), grid, Odometry(), held
-        )
-        spoiled = recorded_odometry(cut, grid, Odometry(), held)
         error = (whole.series["odometry"].values - spoiled.series["odometry"].values)[:, 0, 0]
         errors.append(float(error.sum() * DT))
         unknown = spoiled.series["odometry_unknown"].values[:, 0, 0]
