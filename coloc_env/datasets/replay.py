@@ -29,6 +29,7 @@ from coloc_env.sensors import (
     PositionFix,
     Ranging,
     RecordedImu,
+    RecordedOdometry,
     RecordedSensor,
     Sensor,
     UavBearings,
@@ -36,6 +37,7 @@ from coloc_env.sensors import (
 from coloc_env.series import Series
 
 _FIX = "position_fix"
+_IMU_HELD = 0.1  # s, for which a sample of an IMU stands
 
 
 def recorded_motion(recording: Recording, grid: Grid) -> RecordedMotion:
@@ -106,11 +108,12 @@ def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) ->
     samples are missing leaf ``imu_unknown``."""
     robots, unknown = [], []
     for table, own in zip(recording.streams["imu"], bias, strict=True):
-        whole, missing, spread = bridged(table)
+        whole, missing = bridged(table, _IMU_HELD)
+        gyro, accel = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))  # an axis
         leaf = imu_on(grid, whole, own[:3])
         leaf[:, :3] -= own[3:]
         robots.append(leaf)
-        unknown.append(unknown_on(grid, missing, spread))
+        unknown.append(unknown_on(grid, missing, np.array((accel, gyro))))
     series = {"imu": _series(robots)}
     if np.any(unknown):
         series["imu_unknown"] = _series(unknown)
@@ -121,7 +124,9 @@ def recorded_imu_samples(
     recording: Recording, grid: Grid, sensor: Imu, bias: Floats
 ) -> RecordedImu:
     """``recorded_imu``, and beside the mean over each step its samples, less their bias."""
-    held = [held_intervals(grid, bridged(table)[0]) for table in recording.streams["imu"]]
+    held = [
+        held_intervals(grid, bridged(table, _IMU_HELD)[0]) for table in recording.streams["imu"]
+    ]
     width = max(durations.shape[1] for _, durations in held)
     samples, durations = [], []
     for (values, lasting), own in zip(held, bias, strict=True):
@@ -139,20 +144,29 @@ def recorded_odometry(
     recording: Recording,
     grid: Grid,
     sensor: Odometry,
-    delay: float,
-    scale: float,
+    held: float,
+    delay: float = 0.0,
+    scale: float = 1.0,
     turn_scale: float | None = None,
-) -> RecordedSensor:
-    """Leaf ``odometry``: commands taken to act ``delay`` s later, ``scale`` times as strongly
-    (turns: ``turn_scale``, by default the same)."""
-    robots = []
+) -> RecordedOdometry:
+    """Leaf ``odometry``: samples that stand for ``held`` s at most, taken to act ``delay`` s later,
+    ``scale`` times as strongly (turns: ``turn_scale``, by default the same); and where samples are
+    missing leaf ``odometry_unknown``."""
+    robots, unknown = [], []
     for table in recording.streams["odometry"]:
         values = scale * table.values
         if turn_scale is not None:
             values[:, -1] = turn_scale * table.values[:, -1]
         acting = Table(table.time + round(delay * 1e9), values, table.columns)
-        robots.append(odometry_on(grid, acting))
-    return RecordedSensor(sensor, {"odometry": _series(robots)})
+        whole, missing = bridged(acting, held)
+        spread = acting.values.std(0)
+        sideways = spread[1] if len(spread) == 3 else 0.0
+        robots.append(odometry_on(grid, whole))
+        unknown.append(unknown_on(grid, missing, np.array((spread[0], sideways, spread[-1]))))
+    series = {"odometry": _series(robots)}
+    if np.any(unknown):
+        series["odometry_unknown"] = _series(unknown)
+    return RecordedOdometry(sensor, series)
 
 
 def recorded_bearings(

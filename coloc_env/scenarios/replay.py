@@ -58,6 +58,7 @@ from coloc_env.sensors import (
 )
 
 Pair = tuple[Sensor, Sensor]
+_HELD, _USUAL = 1.0, 10.0  # s, usual intervals: for the longer a sample of odometry stands
 _UNKNOWN = np.pi / 3**0.5  # rad: standard deviation of an attitude of which nothing is known
 
 
@@ -196,7 +197,11 @@ def _odometry(
     recording: Recording, grid: Grid, sensor: Odometry, model: NoiseModel
 ) -> RecordedSensor:
     wheels = model.odometry
-    return recorded_odometry(recording, grid, sensor, wheels.delay, wheels.scale, wheels.turn_scale)
+    tables = recording.streams["odometry"]
+    usual = max(float(np.median(np.diff(table.time))) * 1e-9 for table in tables)
+    held = max(_HELD, _USUAL * usual)
+    corrections = (wheels.delay, wheels.scale, wheels.turn_scale)
+    return recorded_odometry(recording, grid, sensor, held, *corrections)
 
 
 def _prior(recording: Recording, prior: PriorOptions) -> Prior:

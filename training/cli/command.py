@@ -15,6 +15,7 @@ from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
 from training.cli.recording import recording, recordings
 from training.cli.render import render
+from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
@@ -62,6 +63,7 @@ app = typer.Typer(
 )
 for _command in (
     evaluate,
+    report,
     score,
     scenarios,
     agents,
