@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coloc_env.datasets.open_format.yaml_files import Keys, YamlFile
 from coloc_env.datasets.recording import Recording, Table
@@ -70,10 +71,12 @@ class OdometryModel:
 
 @dataclass(frozen=True)
 class ImuBias:
-    """Constant biases of one IMU: rad/s and m/s² in the body frame."""
+    """Constant biases of one IMU, rad/s and m/s² in its own axes, and the rotation vector ``turn``
+    (rad) that takes vectors in the body's axes to the IMU's."""
 
     gyro: tuple[float, ...] = (0.0, 0.0, 0.0)
     accel: tuple[float, ...] = (0.0, 0.0, 0.0)
+    turn: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,11 @@ def corrected(recording: Recording, model: NoiseModel) -> Recording:
                     for robot, table in zip(recording.robots, streams[stream], strict=True)
                 )
             )
+    if "imu" in streams:
+        streams["imu"] = tuple(
+            _in_body(table, model.imu.robots.get(robot, ImuBias()))
+            for robot, table in zip(recording.robots, streams["imu"], strict=True)
+        )
     if "height" in streams:
         streams["height"] = tuple(_less(t, (model.height.bias,)) for t in streams["height"])
     anchors, tags = recording.anchors.copy(), recording.tags.copy()
@@ -216,6 +224,15 @@ def _ranges_corrected(
     return Table(time[there][order], values[there][order], table.columns)
 
 
+def _in_body(table: Table, off: ImuBias) -> Table:
+    """An IMU without its biases, in the body's axes."""
+    if off == ImuBias():
+        return table
+    axes = Rotation.from_rotvec(off.turn).as_matrix()
+    values = table.values - np.array((*off.gyro, *off.accel))
+    return replace(table, values=np.hstack((values[:, :3] @ axes, values[:, 3:] @ axes)))
+
+
 def _less(table: Table, bias: tuple[float, ...]) -> Table:
     return replace(table, values=table.values - np.array(bias)) if any(bias) else table
 
@@ -230,7 +247,7 @@ def _built(
     default = kind()
     for name in file.mapping(*keys):
         at, standard = (*keys, name), getattr(default, name)
-        if name in ("gyro", "accel"):
+        if name in ("gyro", "accel", "turn"):
             found[name] = tuple(file.vector(*at, size=3))
         elif name == "model":
             found[name] = file.choice(at, ("auto", *MODELS), "auto")

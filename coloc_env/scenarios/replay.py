@@ -97,10 +97,8 @@ def replay_own(
     settings: Process = ConstantVelocity(model.motion.accel_std, model.motion.damping or None)
     if kind == "inertial":
         imu = model.imu
-        biases = [imu.robots.get(robot) for robot in recording.robots]
-        bias = np.array([(*b.gyro, *b.accel) if b else (0.0,) * 6 for b in biases])
-        own = Imu(imu.accel_std, imu.gyro_std)
-        sensors.append((recorded_imu(recording, grid, own, bias), own))
+        own, no_bias = Imu(imu.accel_std, imu.gyro_std), np.zeros((len(recording.robots), 6))
+        sensors.append((recorded_imu(recording, grid, own, no_bias), own))
         settings = Inertial(imu.accel_bias, imu.gyro_bias, imu.accel_walk, imu.gyro_walk)
     elif kind == "wheeled":
         wheels = model.odometry

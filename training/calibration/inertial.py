@@ -16,6 +16,7 @@ _DT = 0.1  # s, of the steps whose noise is told
 _STILL = 2.0  # s: shorter than this nothing is learnt from standing
 _QUIET = (0.02, 0.15)  # rad/s, m/s²: a second with less spread than this is one of standing still
 _G = 9.80665
+_TILT = np.radians(3.0)  # of an IMU in its body, before anything is measured
 _BASE = 0.5  # s, of the shortest increments that are compared with truth,
 _WINDOWS = (2, 6, 12)  # of these are the windows over which errors are watched grow
 
@@ -149,7 +150,8 @@ def _against_truth(table: Table, track: Track) -> _Found | None:
     if (end - start) * 1e-9 < 2 * _BASE * max(_WINDOWS):
         return None
     edges = np.arange(start + 10**8, end - 10**8, round(_BASE * 1e9))
-    parts = [_increments(table, track, edges, size) for size in _WINDOWS]
+    aligned, axes = _aligned(table, track, edges)
+    parts = [_increments(aligned, track, edges, size) for size in _WINDOWS]
     if any(len(turn) < 4 for turn, _ in parts):
         return None
     spans = [size * _BASE for size in _WINDOWS]
@@ -163,10 +165,39 @@ def _against_truth(table: Table, track: Track) -> _Found | None:
             for part, span in zip(parts, spans, strict=True)
         ]
         slope = float(np.polyfit(spans, variance, 1)[0])
-        biases.append(tuple(bias.tolist()))
+        biases.append(tuple((axes @ bias).tolist()))
         noises.append(float(np.sqrt(max(slope, 0.02 * variance[0] / spans[0]) / _DT)))
         left.append(float(np.abs(early - late).mean() / 2))
-    return _Found(ImuBias(biases[0], biases[1]), noises[0], noises[1], (left[0], left[1]))
+    turn = tuple(Rotation.from_matrix(axes).as_rotvec().tolist())
+    return _Found(ImuBias(biases[0], biases[1], turn), noises[0], noises[1], (left[0], left[1]))
+
+
+def _aligned(table: Table, track: Track, edges: Stamps) -> tuple[Table, Floats]:
+    """The samples in the axes of the truth's body, and the rotation from those to the IMU's.
+
+    Turns that are read are θ × ω beside those that are true: least squares on increments, with a
+    bias, θ being 3° at most or so before anything is measured.
+    """
+    step = np.diff(table.time, append=table.time[-1:]) * 1e-9
+    read = _turns(table, np.searchsorted(table.time, edges), step).as_rotvec()
+    _, pose, there = pose_at(track, edges)
+    pose_of = _rotation(pose)
+    true = (pose_of[:-1].inv() * pose_of[1:]).as_rotvec()
+    sound = there[:-1] & there[1:]
+    read, true = read[sound], true[sound]
+    # θ × ω = −[ω]× θ
+    x, y, z = true.T
+    zero = np.zeros_like(x)
+    cross = np.stack((zero, z, -y, -z, zero, x, y, -x, zero), 1).reshape(-1, 3)
+    rows = np.hstack((cross, np.tile(np.eye(3), (len(true), 1))))
+    off = (read - true).ravel()
+    noise = max(1.4826 * float(np.median(np.abs(off))), 1e-5)
+    prior = np.diag([noise / _TILT] * 3 + [0.0] * 3)
+    whole = np.vstack((rows, prior))
+    found = np.linalg.lstsq(whole, np.append(off, np.zeros(6)), rcond=None)[0]
+    axes: Floats = Rotation.from_rotvec(found[:3]).as_matrix()
+    turned_back = np.hstack((table.values[:, :3] @ axes, table.values[:, 3:] @ axes))
+    return Table(table.time, turned_back, table.columns), axes
 
 
 def _increments(table: Table, track: Track, edges: Stamps, size: int) -> tuple[Floats, Floats]:

@@ -229,7 +229,7 @@ def calibrate(
             raise ValueError("--tune needs ground truth")
         chosen = dict(parse_override("replay-v0", text) for text in settings or ())
         if span is not None:
-            chosen["span"] = _span(span)
+            chosen.setdefault("span", _span(span))
         with progress() as bars:
             model, words = tuned(model, folder, tune, bars, **chosen)
         notes = (*notes, *words)

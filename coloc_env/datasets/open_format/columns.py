@@ -116,7 +116,7 @@ def _text(path: Path) -> str:
     text = raw.decode("utf-8-sig", errors="replace")
     if "\0" in text:
         raise DataError(f"{path}: not a text file")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def _read_csv(path: Path, known: Mapping[str, Kind], unit: str) -> Columns:
@@ -164,7 +164,7 @@ def _quick(
     once = all(header.count(name) == 1 for name in ("stamp", *wanted))
     if not (numeric and once and body.strip() and _plain(body)):
         return None
-    if "\n\n" in body or body[0] == "\n" or set('"#') & set(body):
+    if "\n\n" in body or body[0] == "\n" or '"' in body or "#" in body:
         return None
     kinds = dict.fromkeys(wanted, "f8") | {"stamp": "i8" if unit == "ns" else f"S{_STAMP}"}
     dtype = [(f"{i}", kinds.get(name, "S1")) for i, name in enumerate(header)]

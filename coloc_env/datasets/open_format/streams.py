@@ -149,7 +149,7 @@ def _sightings(found: Columns, about: Description) -> Made:
     for what, among, first in (("landmark", seen >= robots, robots), ("uav", seen < robots, 0)):
         if among.any():
             there, name = among & good, "landmark" if what == "landmark" else "robot"
-            rows = np.column_stack((seen[there] - first, values[there]))
+            rows: Floats = np.column_stack((seen[there] - first, values[there]))
             table = Table(found.time[there], rows, (name, *columns))
             made[f"{what}_{kind}"] = (table, int((among & ~good).sum()))
     return made
