@@ -23,6 +23,7 @@ from training.evaluation.record import record
 
 MEASURED, MOTION = (0.5, 0.7, 1.0, 1.4, 2.0), (0.5, 1.0, 2.0, 4.0)
 _BETTER = 0.97  # of the error: what is no better than this is left
+_RUNS = 5  # draws of the prior
 _DRIVERS = {
     "odometry": ("forward_std", "left_std", "turn_std", "relative"),
     "imu": ("accel_std", "gyro_std"),
@@ -76,13 +77,13 @@ def tuned(
 
 
 def error_of(model: NoiseModel, folder: Path, agent: str, **overrides: Any) -> float:
-    """RMSE (m) of an agent that believes a model."""
+    """RMSE (m) of an agent that believes a model, over some draws of the prior."""
     with TemporaryDirectory() as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(scratch) / "believed.yaml"
         path.write_text(write_noise_model(model), encoding="utf-8")
         scenario = make_scenario("replay-v0", path=str(folder), believed=str(path), **overrides)
-        found = record(make(agent, scenario), scenario, torch.tensor([0]))
+        found = record(make(agent, scenario), scenario, torch.arange(_RUNS))
     value = rmse(found.error, found.worlds.scored)
     return value if np.isfinite(value) and not found.broken.any() else float("inf")
 
