@@ -14,11 +14,17 @@ TASKS = Registry(
     "task",
     "coloc.tasks",
     {
+        "beacon-hard-v0": "agents.tasks.beacon:BeaconHard",
         "beacon-v0": "agents.tasks.beacon:Beacon",
+        "convoy-hard-v0": "agents.tasks.convoy:ConvoyHard",
         "convoy-v0": "agents.tasks.convoy:Convoy",
+        "relay-hard-v0": "agents.tasks.relay:RelayHard",
         "relay-v0": "agents.tasks.relay:Relay",
+        "schedule-hard-v0": "agents.tasks.schedule:ScheduleHard",
         "schedule-v0": "agents.tasks.schedule:Schedule",
+        "survey-hard-v0": "agents.tasks.survey:SurveyHard",
         "survey-v0": "agents.tasks.survey:Survey",
+        "track-hard-v0": "agents.tasks.track:TrackHard",
         "track-v0": "agents.tasks.track:Track",
     },
 )
@@ -35,5 +41,5 @@ def make_task(name: str, **chosen: Any) -> Task:
     for text in texts:
         key, value = options.parse(name, text, known)
         chosen[key] = value
-    made: Task = factory(**options.checked(name, chosen, known))
+    made: Task = factory(**options.grouped(factory, options.checked(name, chosen, known)))
     return made

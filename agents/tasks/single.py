@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from agents.tasks.registry import make_task
-from agents.tasks.task import Seen, Task
+from agents.tasks.rules import Seen
+from agents.tasks.task import Task
 from coloc_env.envs.actions import ModeRunner, action_space, checked_arrays, checked_tensor
 from coloc_env.observation import flat_box
 from coloc_env.seeding import checked_seed, random_seed

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from agents.tasks import make_task
 from agents.tasks.runner import rollout
-from agents.tasks.task import Policy, Seen, Task
+from agents.tasks.rules import Policy, Seen
+from agents.tasks.task import Task
 
 FIRST_SEED = 10**9  # of the protocol's worlds; trainings use seeds below
 WORLDS = 256
