@@ -21,7 +21,7 @@ ABOUT = {
     "velocity": "own velocity / top speed",
     "sigma": "log σ of the own position along the major and the minor horizontal axis, and upright "
     "where there are three, 0.05 … 20 m as −1 … 1",
-    "shape": "(P_xx − P_yy) / tr P and 2 P_xy / tr P",
+    "ellipse": "(P_xx − P_yy) / tr P and 2 P_xy / tr P",
     "neighbours": "each other UAV that acts, the nearest first: Δ / 2R, Δ / 10 m, log σ, whether "
     "it was ranged to, velocity / top speed",
     "targets": "each UAV that does not act: Δ / 2R, Δ / 10 m, log σ, whether it was ranged to",
@@ -51,7 +51,7 @@ def common(task: "Task", memory: TaskMemory) -> dict[str, Float32[Tensor, "B n F
         "position": 2 * (own - task.low) / (task.high - task.low) - 1,
         "velocity": memory.velocity[:, :n] / task.v_max,
         "sigma": log_sigmas(p),
-        "shape": shape / p.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).clamp_min(1e-9),
+        "ellipse": shape / p.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).clamp_min(1e-9),
     }
     others = task.others(memory)
     about = _about(task, memory, others)
