@@ -1,8 +1,11 @@
-"""Tasks by name, and building one with its options."""
+"""Tasks by name, building one with its options, and their names in other libraries."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import pettingzoo
 
 from coloc_env import options
 from coloc_env.registry import Registry
@@ -43,3 +46,17 @@ def make_task(name: str, **chosen: Any) -> Task:
         chosen[key] = value
     made: Task = factory(**options.grouped(factory, options.checked(name, chosen, known)))
     return made
+
+
+def register() -> None:
+    """Register all tasks with PettingZoo and Gymnasium, as ``coloc/NAME``."""
+    for task in TASKS:
+        name, chosen = f"coloc/{task}", {"task": task}
+        if name not in gymnasium.registry:
+            home = "agents.tasks.single:SingleAgentTask"
+            gymnasium.register(name, home, kwargs=chosen)
+        if hasattr(pettingzoo, "register"):  # since 1.27
+            for face, maker in (("parallel", "parallel_env"), ("aec", "env")):
+                pettingzoo.register(
+                    face, name, entry_point=f"agents.tasks.faces:{maker}", kwargs=chosen
+                )

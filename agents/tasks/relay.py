@@ -7,6 +7,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from agents.tasks.gains import directions
+from agents.tasks.cem import OthersKnown
 from agents.tasks.memory import TaskMemory
 from agents.tasks.options import Drift, SteeredTaskOptions
 from agents.tasks.rules import Seen, idle, random_policy, steer, towards
@@ -128,6 +129,7 @@ class Relay(Task):
         "lattice": lattice,
         "greedy": greedy,
     }
+    planners: ClassVar = {"cem": OthersKnown}
     best = "greedy"
 
     def __init__(

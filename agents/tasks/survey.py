@@ -6,8 +6,10 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
+from agents.tasks.cem import Cem
 from agents.tasks.memory import TaskMemory, total_sigma
 from agents.tasks.options import Drift, SteeredTaskOptions
+from agents.tasks.prediction import Outlook
 from agents.tasks.rules import Seen, idle, random_policy, towards
 from agents.tasks.space import Space
 from agents.tasks.task import Task, sensors, task_scenario
@@ -72,6 +74,21 @@ def frontier(seen: Seen) -> Tensor:
     return nearest(seen, near < 2, 1.5)
 
 
+class Planner(Cem):
+    """Cross-entropy planning of the next 12 s, for what will be covered."""
+
+    def begin(self, seen: Seen, samples: int) -> Tensor:
+        return seen.memory.more["covered"][:, 0].repeat_interleave(samples, 0)
+
+    def gain(
+        self, seen: Seen, now: Outlook, kept: Tensor | None
+    ) -> tuple[Float[Tensor, "M"], Tensor | None]:
+        assert kept is not None
+        known = 1 - (-(_KNOWN**2) / now.sigma.clamp_min(1e-3) ** 2).exp()
+        after = kept.scatter_reduce(1, cell_of(now.position), known, "amax")
+        return (after - kept).sum(-1), after
+
+
 class Survey(Task):
     """Four UAVs cover an area of 100 × 100 m, with three anchors in one corner.
 
@@ -87,6 +104,7 @@ class Survey(Task):
         "home": home_when_lost,
         "frontier": frontier,
     }
+    planners: ClassVar = {"cem": Planner}
     best = "frontier"
     about: ClassVar = {
         "map": "the 5 × 5 cells about the own one: open −1, covered or outside 1",

@@ -6,7 +6,7 @@ pure functions of it. What agents see is made of estimates alone; rewards are of
 
 import copy
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
@@ -53,7 +53,7 @@ class Task(ActionMode):
     """Base of all tasks: ``scenario``, ``n_agents`` UAVs that act, and options.
 
     ``policies``: heuristics by name, ``random`` and ``idle`` among them; ``best``: the best one
-    that is known. ``sampled``: policies that learn are to be scored by actions drawn from them, not
+    that is known. ``planners``: makers of policies that search, far slower. ``sampled``: policies that learn are to be scored by actions drawn from them, not
     by the most probable ones. ``shared``: what is rewarded is nobody's own. ``about``: what the
     task's own parts of the observation are. ``hard``: in space, with walls.
     """
@@ -61,6 +61,7 @@ class Task(ActionMode):
     rewards = True
     whole = True
     policies: ClassVar[Mapping[str, Policy]]
+    planners: ClassVar[Mapping[str, Callable[[], Policy]]] = {}
     best: ClassVar[str]
     sampled: ClassVar[bool] = False
     shared: ClassVar[bool] = False
@@ -135,9 +136,9 @@ class Task(ActionMode):
         return {name: texts[name] + (aged if name in heard else "") for name in self.widths}
 
     def policy(self, name: str) -> Policy:
-        """A heuristic by name; ValueError, with all there are, for an unknown one."""
-        require_known(f"policy of {self.name}", [name], self.policies)
-        return self.policies[name]
+        """A heuristic or planner by name; ValueError, with all there are, for an unknown one."""
+        require_known(f"policy of {self.name}", [name], (*self.policies, *self.planners))
+        return self.planners[name]() if name in self.planners else self.policies[name]
 
     def with_options(self, **more: Any) -> Self:
         """The same task in the same scenario with other values of options that change no world:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from agents.tasks.cem import OthersKnown
 from agents.tasks.memory import TaskMemory
 from agents.tasks.options import Drift, SteeredTaskOptions
 from agents.tasks.rules import Seen, idle, random_policy, towards
@@ -80,6 +81,7 @@ class Track(Task):
         "worst": worst,
         "pairs": pairs,
     }
+    planners: ClassVar = {"cem": OthersKnown}
     best = "pairs"
 
     def __init__(

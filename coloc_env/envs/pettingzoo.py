@@ -271,9 +271,12 @@ class _Tally:
 class _Cycle(parallel_to_aec_wrapper):
     """PettingZoo's agent-environment cycle, each observation of which is a copy."""
 
-    def observe(self, agent: str) -> dict[str, np.ndarray]:
+    def observe(self, agent: str) -> Any:
         """What the agent observes until all have acted."""
-        return {name: leaf.copy() for name, leaf in super().observe(agent).items()}
+        seen = super().observe(agent)
+        if isinstance(seen, dict):
+            return {name: leaf.copy() for name, leaf in seen.items()}
+        return seen.copy()
 
 
 def parallel_env(

@@ -32,7 +32,7 @@ class CoLocEnv(EnvBase):
     ``("uav", "reward")`` [B, N, 1], ``("uav", "mask")`` [B, N] (UAVs that have not failed),
     ``state`` [B, S] (privileged truth, and the error of what actions are relative to) and root
     ``done``, ``terminated``, ``truncated`` [B, 1]: an episode ends at its horizon, by truncation;
-    a world in which every UAV failed terminates.
+    a world in which every UAV failed terminates. ``group_map`` names the one group.
 
     Row b of the first episode is the world of seed ``seed + b``, of the next one
     ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's. Without ``seed``
@@ -56,6 +56,7 @@ class CoLocEnv(EnvBase):
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)
         self.mode = make_mode(scenario, action)
+        self.group_map = {"uav": scenario.agents[: self.mode.n_agents]}
         self._runner = ModeRunner(self.mode, self.world)
         self._sensed: Sensed | None = None
         self._set_seed(random_seed() if seed is None else seed)

@@ -36,7 +36,7 @@ def actions_of(task: Task, seeds: Tensor, k: int) -> Tensor:
     keys = noise.fold(noise.row_keys(seeds), k)
     n = task.n_agents
     if task.choices is None:
-        return noise.normal(keys, "actions", 2 * n).unflatten(-1, (n, 2)).clamp(-1, 1)
+        return noise.normal(keys, "actions", task.width * n).unflatten(-1, (n, -1)).clamp(-1, 1)
     return (noise.uniform(keys, "actions", n) * task.choices).long()
 
 
