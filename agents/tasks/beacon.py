@@ -65,7 +65,7 @@ class Beacon(Task):
         n_uavs: PositiveCount = 10,
         horizon: PositiveCount = 100,
         drift: Drift = 0.3,
-        task: TaskOptions = TaskOptions("ekf:fusion=ci:iterations=1", credit="own"),
+        task: TaskOptions = TaskOptions("ekf:fusion=ci:second_order=true", credit="own"),
     ) -> None:
         space = Space((_SIDE, _SIDE), self.hard, _WALLS)
         scenario = task_scenario(

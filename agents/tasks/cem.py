@@ -20,7 +20,7 @@ class Cem(ABC):
     worlds at a time; it sees all that the estimator says, so it is no policy for one UAV.
     """
 
-    steps, hold, samples, elites, iterations = 12, 2, 48, 8, 4
+    steps, hold, samples, elites, iterations = 10, 2, 32, 6, 3
     spread = 0.6  # of plans at first, in units of the top speed
 
     def __init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor

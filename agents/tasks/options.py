@@ -42,6 +42,4 @@ class SteeredTaskOptions(TaskOptions):
 
     def steered(self, v_max: float, a_max: float, start: Box, space: Space) -> Steered:
         """The motion of those that act."""
-        return Steered(
-            self.control, v_max, a_max, start, space.walls, self.j_max, self.keep_apart
-        )
+        return Steered(self.control, v_max, a_max, start, space.walls, self.j_max, self.keep_apart)

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.tasks.gains import directions
 from agents.tasks.cem import OthersKnown
+from agents.tasks.gains import directions
 from agents.tasks.memory import TaskMemory
 from agents.tasks.options import Drift, SteeredTaskOptions
 from agents.tasks.rules import Seen, idle, random_policy, steer, towards

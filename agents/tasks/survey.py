@@ -75,7 +75,7 @@ def frontier(seen: Seen) -> Tensor:
 
 
 class Planner(Cem):
-    """Cross-entropy planning of the next 12 s, for what will be covered."""
+    """Cross-entropy planning of the next 10 s, for what will be covered."""
 
     def begin(self, seen: Seen, samples: int) -> Tensor:
         return seen.memory.more["covered"][:, 0].repeat_interleave(samples, 0)

@@ -185,8 +185,7 @@ class Task(ActionMode):
     def observe(self, memory: TaskMemory, observation: Observation) -> tuple[TaskMemory, Leaves]:
         memory = self._estimated(memory, observation)
         found = {
-            name: part.nan_to_num(0.0).clamp(-1.0, 1.0)
-            for name, part in self.parts(memory).items()
+            name: part.nan_to_num(0.0).clamp(-1.0, 1.0) for name, part in self.parts(memory).items()
         }
         leaves = found
         if self.flat:

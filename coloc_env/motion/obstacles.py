@@ -19,7 +19,9 @@ def stopped(
         still = way == 0
         within = (start > bottom) & (start < top)
         first, second = (bottom - start) / way, (top - start) / way
-        enter = torch.where(still, torch.where(within, -torch.inf, torch.inf), first.minimum(second))
+        enter = torch.where(
+            still, torch.where(within, -torch.inf, torch.inf), first.minimum(second)
+        )
         leave = torch.where(still, torch.inf, first.maximum(second))
         enters, axis = enter.max(-1, keepdim=True)
         meets = (enters >= 0) & (enters < 1) & (enters < leave.amin(-1, keepdim=True))

@@ -153,4 +153,3 @@ def _run(task: Task, policy: Policy, seeds: Tensor) -> dict[str, Floats]:
     figures = {"team": team, "first": first, "error": error}
     figures |= {name: value[:, : task.n_agents].sum(-1) for name, value in spent.items()}
     return {name: value.double().numpy() for name, value in figures.items()}
-

@@ -15,9 +15,9 @@ from torchrl.envs.utils import check_env_specs
 import coloc_env
 from agents.tasks import TASKS, make_task
 from agents.tasks.gains import anchor_gains, range_gains
+from agents.tasks.rules import Seen
 from agents.tasks.runner import rollout
 from agents.tasks.single import SingleAgentTask
-from agents.tasks.rules import Seen
 from agents.tasks.task import Task
 from coloc_env import noise
 from coloc_env.envs.sb3 import CoLocVecEnv
