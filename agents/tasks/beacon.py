@@ -43,7 +43,8 @@ class Beacon(Task):
     """Ten UAVs on waypoints, two anchors that only the near can range to. Each speaks or listens;
     who hears exactly one ranges to it and fuses its estimate, by covariance intersection.
 
-    Reward of each: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise, m/√m.
+    Reward of each: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise,
+    m/√m.
     A local rule does as well as a planner here: a sanity check more than a challenge.
     """
 
