@@ -11,6 +11,8 @@ TRAININGS = Registry(
         "nnhpff": "training.learning.nnhpff:nnhpff",
         "pfnn": "training.learning.pfnn:pfnn",
         "sb3-ppo": "training.learning.sb3_ppo:sb3_ppo",
+        "task-ippo": "training.learning.tasks.ppo:task_ippo",
+        "task-mappo": "training.learning.tasks.ppo:task_mappo",
         "stdcl": "training.learning.stdcl:stdcl",
         "trust": "training.learning.trust:trust",
     },
