@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor, nn
 
 from agents.layers import Linear
+from agents.policies.actor import SQUASHES
 from agents.weights import Learned
 
 NETWORKS = ("feedforward", "recurrent", "attention", "candidates")
@@ -60,7 +61,9 @@ class TaskActor(Learned):
     graph attention over neighbours between the layers; ``candidates``, every choice scored by one
     network from what its exchange would do. ``outputs``: choices, or numbers of an action where
     ``discrete`` is not set. ``task``: with its options; ``moves`` and ``hold``: the menu that
-    choices stand for, and for how many steps each is held.
+    choices stand for, and for how many steps each is held. ``sampled``: choices are drawn, not the
+    likeliest taken, as those on a channel that equals share must be. ``squash``: how means become
+    numbers in [−1, 1].
     """
 
     kind = "task policy"
@@ -76,6 +79,8 @@ class TaskActor(Learned):
         moves: str = "none",
         hold: int = 1,
         features: int = 0,
+        sampled: bool = False,
+        squash: str = "tanh",
     ) -> None:
         super().__init__()
         self.architecture: Mapping[str, Any] = {
@@ -88,10 +93,12 @@ class TaskActor(Learned):
             "moves": moves,
             "hold": hold,
             "features": features,
+            "sampled": sampled,
+            "squash": squash,
         }
         more = (f"{RELATIONS[network]}[{features}]",) if features else ()
         self.features = (f"observation[{observation}]", *more)  # type: ignore[misc]
-        self.network, self.discrete = network, discrete
+        self.network, self.discrete, self.squash = network, discrete, SQUASHES[squash]
         self.first = Layer(observation, hidden)
         self.neighbours = Neighbours(hidden, features) if network == "attention" else None
         self.memory = nn.GRUCell(hidden, hidden) if network == "recurrent" else None

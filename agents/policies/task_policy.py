@@ -14,9 +14,8 @@ from agents.weights import learned
 class TaskPolicy:
     """An actor in a task: decisions held as it was trained to, its memory going from step to step.
 
-    Where actions are choices of the task's own, on a channel that all share, it draws them
-    (the likeliest of equals would collide for ever); else it takes the likeliest, or the mean. An
-    episode's first step is noticed; one object is good for one set of worlds at a time.
+    It draws choices where it was trained to (the likeliest of equals would collide for ever on a
+    channel); else it takes the likeliest, or the mean. An episode's first step is noticed; one object is good for one set of worlds at a time.
     """
 
     def __init__(self, task: Task, actor: TaskActor) -> None:
@@ -44,8 +43,8 @@ class TaskPolicy:
         out, self._memory = actor(seen.observation, seen.mask, more, self._memory)
         actor.train(training)
         if not actor.discrete:
-            return torch.tanh(out)
-        if self.task.choices is None:
+            return actor.squash(out)
+        if not self.actor.architecture["sampled"]:
             choice = out.argmax(-1)
         else:
             flat = out.softmax(-1).flatten(0, 1)

@@ -13,6 +13,8 @@ TRAININGS = Registry(
         "sb3-ppo": "training.learning.sb3_ppo:sb3_ppo",
         "task-ippo": "training.learning.tasks.ppo:task_ippo",
         "task-mappo": "training.learning.tasks.ppo:task_mappo",
+        "task-qmix": "training.learning.tasks.qmix:task_qmix",
+        "task-sb3-ppo": "training.learning.tasks.sb3:task_sb3_ppo",
         "stdcl": "training.learning.stdcl:stdcl",
         "trust": "training.learning.trust:trust",
     },

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -57,10 +57,17 @@ class Reader(nn.Module):
     """An actor as a collector and a loss call it: step by step, where a recurrent one's memory goes
     on from call to call, or [B, T] whole episodes of a recurrent one."""
 
-    def __init__(self, actor: TaskActor, masked: bool, related: bool) -> None:
+    def __init__(self, actor: TaskActor, masked: bool) -> None:
         super().__init__()
-        self.actor, self.masked, self.related = actor, masked, related
+        self.actor, self.masked = actor, masked
+        self.related = actor.architecture["features"] > 0
         self.carried: Tensor | None = None
+
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """What it reads."""
+        read = (True, self.masked, self.related)
+        return [key for key, there in zip(_READ, read, strict=True) if there]
 
     def forward(self, observation: Tensor, *more: Tensor) -> Any:
         rest = list(more)
@@ -75,13 +82,11 @@ class Reader(nn.Module):
 
 def policy_of(actor: TaskActor, task: Task) -> tuple[Reader, ProbabilisticActor]:
     """The actor as TorchRL's loss wants it: what is read → the decision and its log-probability."""
-    masked, related = task.choices is not None, actor.architecture["features"] > 0
-    reader = Reader(actor, masked, related)
-    keys = [_READ[0], *([_READ[1]] if masked else []), *([_READ[2]] if related else [])]
+    reader = Reader(actor, task.choices is not None)
     names = ["logits"] if actor.discrete else ["loc", "scale"]
     outs = [(_UAV, name) for name in names]
     return reader, ProbabilisticActor(
-        TensorDictModule(reader, keys, outs),
+        TensorDictModule(reader, reader.keys, outs),
         in_keys=dict(zip(names, outs, strict=True)),
         out_keys=[_DECIDED],
         distribution_class=torch.distributions.Categorical if actor.discrete else TanhNormal,
@@ -99,8 +104,6 @@ def acting(policy: nn.Module, actor: TaskActor, task: Task) -> Any:
         [_DECIDED],
         [(_UAV, "action")],
     )
-    from tensordict.nn import TensorDictSequential
-
     return TensorDictSequential(policy, act)
 
 
@@ -164,6 +167,7 @@ def _ppo(
             moves,
             hold,
             relations_width(made, network),
+            sampled=made.choices is not None,
         )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
@@ -238,7 +242,7 @@ def _ppo(
     trainer = make_trainer(collector, loss, optimizer, None, passes=passes, clip_norm=0.5)
     trainer.register_op("batch_process", fill)
     trainer.register_op("process_optim_batch", ReplayBufferTrainer(buffer, iterate=True).sample)
-    trainer.register_op("pre_steps_log", _figures)
+    trainer.register_op("pre_steps_log", figures)
     return Training(
         module=actor,
         collector=collector,
@@ -273,7 +277,7 @@ def task_ippo(**options: Any) -> Training:
     return _ppo("task-ippo", IPPOLoss, **options)
 
 
-def _figures(batch: TensorDictBase) -> dict[str, float]:
+def figures(batch: TensorDictBase) -> dict[str, float]:
     """Returns of a batch's episodes: the task's, and of the reward that trains."""
     trained = batch["next", _UAV, "reward"].mean(2).sum(1)
     return {"return": float(batch["next", "score"].sum(1).mean()), "trained": float(trained.mean())}
