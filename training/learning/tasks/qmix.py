@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -45,6 +45,24 @@ class Mixer(nn.Module):
 
     def forward(self, chosen: Tensor, state: Tensor) -> Tensor:
         return self.mixer(chosen, (state - self.middle) / self.extent)
+
+
+class Kept:
+    """A replay buffer as a run's state keeps it: its rows in their places, and the next place."""
+
+    def __init__(self, buffer: ReplayBuffer) -> None:
+        self.buffer = buffer
+
+    def state_dict(self) -> dict[str, Any]:
+        rows = dict(self.buffer[:].flatten_keys(".").items()) if len(self.buffer) else {}
+        return {"rows": rows, "writer": self.buffer.writer.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        rows = state_dict["rows"]
+        if rows:
+            count = len(next(iter(rows.values())))
+            self.buffer.extend(TensorDict(rows, [count]).unflatten_keys("."))
+        self.buffer.writer.load_state_dict(state_dict["writer"])
 
 
 def task_qmix(
@@ -144,7 +162,11 @@ def task_qmix(
             group["lr"] = learning_rate * (1 - epoch / epochs)
         frames = worlds * decisions
         return Collector(
-            worlds_of(epoch), player, frames_per_batch=frames, total_frames=frames
+            worlds_of(epoch),
+            player,
+            frames_per_batch=frames,
+            total_frames=frames,
+            auto_register_policy_transforms=False,
         )
 
     def fill(batch: TensorDictBase) -> None:
@@ -160,10 +182,9 @@ def task_qmix(
     trainer = make_trainer(
         EpochCollector(collect, epochs), loss, optimizer, updates, clip_norm=10.0
     )
-    replay = ReplayBufferTrainer(buffer)
-    trainer.register_module("replay_buffer", replay)
+    trainer.register_module("replay_buffer", Kept(buffer))
     trainer.register_op("batch_process", fill)
-    trainer.register_op("process_optim_batch", replay.sample)
+    trainer.register_op("process_optim_batch", ReplayBufferTrainer(buffer).sample)
     target = HardUpdate(loss, value_network_update_interval=target_every)
     trainer.register_op("post_optim", TargetNetUpdaterHook(target))
     trainer.register_op("pre_steps_log", figures)

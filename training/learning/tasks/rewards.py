@@ -4,6 +4,7 @@ Scores are always the task's own. A reward here may use the truth, as the task's
 """
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
@@ -21,7 +22,12 @@ from coloc_env.world import World
 class Reward(ABC):
     """A reward of a task; it keeps what it needs from step to step, [B, …] each."""
 
+    tasks: ClassVar[tuple[str, ...]] = ()  # whom it is for; none: for all
+
     def __init__(self, task: Task) -> None:
+        if self.tasks and task.name not in self.tasks:
+            name = next(key for key, one in REWARDS.items() if one is type(self))
+            raise ValueError(f"reward={name} is for {', '.join(self.tasks)}, not for {task.name}")
         self.task = task
 
     def start(self, memory: TaskMemory) -> None:
@@ -94,6 +100,8 @@ class Difference(Reward):
     Both are predicted from the covariance before the step: exchanges succeed as the channel has
     them, and each takes its part off the covariance, one after another.
     """
+
+    tasks = ("schedule-v0",)
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)

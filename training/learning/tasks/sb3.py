@@ -34,7 +34,7 @@ def exported(model: PPO, actor: TaskActor) -> None:
             actor.log_std.copy_(policy.log_std)
 
 
-class _Return(BaseCallback):
+class Return(BaseCallback):
     """Logs the mean return of a rollout's episodes, with PPO's figures of training on it."""
 
     def _on_rollout_start(self) -> None:
@@ -114,7 +114,7 @@ def task_sb3_ppo(
         partial(exported, model, actor),
         epochs,
         partial(world_seed, seed, worlds=worlds),
-        _Return,
+        Return,
     )
     return Training(
         module=actor,
