@@ -32,14 +32,16 @@ class ActionMode(ABC):
     there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
     what the mode adds to each UAV's observation, ``features`` those that a policy should read,
     ``meaning`` the words for an action in error messages. ``choices``: actions are one of so many
-    (None: numbers within ``bounds``). ``whole``: its leaf ``observation`` is all that agents see, a
-    flat vector within its bounds, with their ``action_mask`` where actions are choices.
+    (None: numbers within ``bounds``). ``whole``: its leaves are all that agents see, with their
+    ``action_mask`` where actions are choices: one flat vector ``observation`` where it is ``flat``,
+    else a Dict.
     ``rewards``: rewards are its own, of what is estimated after the step.
     """
 
     name: str
     choices: int | None = None
     whole: bool = False
+    flat: bool = True
     meaning: str
     rewards: bool = False
     features: tuple[str, ...] = ()
@@ -105,6 +107,23 @@ class ActionMode(ABC):
     def reference(self, memory: Any) -> Float32[Tensor, "B N d"] | None:
         """The position (m) that actions are relative to; None where they are not."""
         return None
+
+    def state(self, memory: Any, world: World) -> Float32[Tensor, "B S"]:
+        """What a critic may know: the truth, and the error in m of what actions are relative to,
+        if they are."""
+        truth, reference = world.state(), self.reference(memory)
+        if reference is None:
+            return truth
+        error = (reference - world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
+        return torch.cat((truth, error.flatten(-2)), -1)
+
+    def state_bounds(self, scenario: Scenario) -> tuple[list[float], list[float]]:
+        """Bounds of the flat state."""
+        low, high = state_bounds(scenario)
+        if type(self).reference is not ActionMode.reference:
+            more = scenario.arena.n_uavs * self.dim
+            low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
+        return low, high
 
 
 class Estimates(ActionMode):
@@ -204,13 +223,8 @@ class ModeRunner:
         return self._memory
 
     def state(self) -> Float32[Tensor, "B S"]:
-        """What a critic may know: the truth, and the error in m of what actions are relative to,
-        if they are."""
-        truth, reference = self.world.state(), self.mode.reference(self._memory)
-        if reference is None:
-            return truth
-        error = (reference - self.world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
-        return torch.cat((truth, error.flatten(-2)), -1)
+        """What a critic may know."""
+        return self.mode.state(self._memory, self.world)
 
 
 def action_space(mode: ActionMode) -> gym.spaces.Space[Any]:
@@ -250,22 +264,14 @@ def chosen_leaves(
     all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
     not end together."""
     known = observed_leaves(scenario, mode)
-    names = tuple(wanted or (("observation",) if mode.whole else mode.features or known))
+    own = [name for name in known if name != "action_mask"]
+    names = tuple(wanted or (own if mode.whole else mode.features or known))
     for name in names:
         if name not in known:
             raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")
     if scenario.failure_rate or scenario.failures:
         raise ValueError(f"{scenario.name}: UAVs that fail do not fit rows of one UAV each")
     return {name: known[name] for name in names}
-
-
-def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:
-    """Bounds of the flat state: the truth's, and those of the error that goes with the mode."""
-    low, high = state_bounds(scenario)
-    if type(mode).reference is not ActionMode.reference:
-        more = scenario.arena.n_uavs * mode.dim
-        low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
-    return low, high
 
 
 # ------------------------------------------------------------------ checks of actions

@@ -15,9 +15,10 @@ from torchrl.envs.utils import check_env_specs
 import coloc_env
 from agents.tasks import TASKS, make_task
 from agents.tasks.gains import anchor_gains, range_gains
+from agents.tasks.rules import Seen
 from agents.tasks.runner import rollout
 from agents.tasks.single import SingleAgentTask
-from agents.tasks.task import Seen, Task
+from agents.tasks.task import Task
 from coloc_env import noise
 from coloc_env.envs.sb3 import CoLocVecEnv
 from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv
@@ -35,7 +36,7 @@ def actions_of(task: Task, seeds: Tensor, k: int) -> Tensor:
     keys = noise.fold(noise.row_keys(seeds), k)
     n = task.n_agents
     if task.choices is None:
-        return noise.normal(keys, "actions", 2 * n).unflatten(-1, (n, 2)).clamp(-1, 1)
+        return noise.normal(keys, "actions", task.width * n).unflatten(-1, (n, -1)).clamp(-1, 1)
     return (noise.uniform(keys, "actions", n) * task.choices).long()
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from agents.tasks import make_task
+from agents.tasks.rules import Seen
 from agents.tasks.runner import rollout
-from agents.tasks.task import Seen
 from training.cli.command import app
 from training.evaluation.score import FIRST_SEED, bootstrap, interquartile_mean, score
 
