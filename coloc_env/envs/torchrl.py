@@ -114,6 +114,11 @@ class CoLocEnv(EnvBase):
         b = self.batch_size[0]
         return CoLocEnv(self.scenario, b, self.device, self.first_seed, action)
 
+    @property
+    def memory(self) -> Any:
+        """The action mode's memory at the step last observed."""
+        return self._runner.memory
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.first_seed = checked_seed(seed, self.scenario.name)
