@@ -152,8 +152,8 @@ class Estimates(ActionMode):
     def bounds(self) -> tuple[list[float], list[float]]:
         low, high = action_bounds(self.believed.arena)
         more = [self.largest] * self.dim if self.largest else []
-        low, high = low + [-x for x in more], high + more
-        return (low + [-1.0], high + [float(self.last)]) if self.calls else (low, high)
+        calls = [float(self.last)] if self.calls else []
+        return low + [-x for x in more] + [-1.0 for _ in calls], high + more + calls
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]

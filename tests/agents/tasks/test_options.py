@@ -164,10 +164,9 @@ def test_predicted_variances_are_those_that_the_filter_gets() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["survey-v0", "track-v0"])
-def test_planning_is_worth_more_than_the_best_rule(name: str) -> None:
+def test_planning_is_worth_more_than_the_best_rule() -> None:
     returns = {
-        rule: float(sum(step.reward.mean() for step in steps(name, rule)))
-        for rule in ("cem", make_task(name).best)
+        rule: float(sum(step.reward.mean() for step in steps("track-v0", rule)))
+        for rule in ("cem", "pairs")
     }
-    assert returns["cem"] > returns[make_task(name).best]
+    assert returns["cem"] > returns["pairs"] + 2.0
