@@ -19,6 +19,7 @@ from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
+from training.cli.view import view
 
 
 class _Plain(TyperGroup):
@@ -70,6 +71,7 @@ for _command in (
     recordings,
     tasks,
     render,
+    view,
     bench,
     train,
     reproduce,
