@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_env.datasets.recording import Recording, Stamps, Table, Track
-from coloc_env.datasets.residuals import Link, best_delay, links_of, robust, true_ranges
+from coloc_env.datasets.residuals import Link, best_delay, has_truth, links_of, robust, true_ranges
 
 _GAPS = 10.0  # times the usual interval, and
 _GAP = 1.0  # s: longer than both is a gap
 _FAR = 3.0  # robust deviations beyond which a range is an outlier
+_LATE = 0.05  # s
 _MANY = 30  # ranges, of fewer of which a share says nothing
 _G = 9.80665
 
@@ -63,7 +64,7 @@ def check(recording: Recording) -> Report:
         if (report := _link(recording, link)) is not None
     )
     found = [*_about_time(recording, rows), *_about_imu(recording), *_about_reach(recording)]
-    found += _about_ranges(links)
+    found += [*_about_delays(recording), *_about_ranges(links)]
     found += [
         (5, f"{count} of {stream} are left out: no sensor can have measured them")
         for stream, count in recording.dropped.items()
@@ -85,8 +86,7 @@ def _stream(robot: str, stream: str, table: Table | Track) -> StreamReport:
 
 
 def _link(recording: Recording, link: Link) -> LinkReport | None:
-    ends = [link.robot] if link.to_anchor else [link.robot, link.other]
-    if not all(len(recording.truth[end].time) > 1 for end in ends):
+    if not has_truth(recording, link):
         return None
     delay = best_delay(recording, [link])
     distance, known = true_ranges(recording, link, delay)
@@ -195,6 +195,17 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     return found
 
 
+def _about_delays(recording: Recording) -> list[tuple[int, str]]:
+    """Streams of ranges whose stamps are late, all links together."""
+    found = []
+    for stream in ("anchor_ranges", "uav_ranges"):
+        known = [link for link in links_of(recording, stream) if has_truth(recording, link)]
+        delay = best_delay(recording, known)
+        if abs(delay) >= _LATE:
+            found.append((2, f"{stream}: stamps are {delay:+.2f} s late (calibrate)"))
+    return found
+
+
 def _about_ranges(links: tuple[LinkReport, ...]) -> list[tuple[int, str]]:
     found = []
     for link in links:
@@ -202,8 +213,6 @@ def _about_ranges(links: tuple[LinkReport, ...]) -> list[tuple[int, str]]:
             found.append((1, f"{link.link}: ranges are off by {link.bias:+.2f} m: map or frame?"))
         elif abs(link.bias) > 0.1:
             found.append((3, f"{link.link}: ranges are off by {link.bias:+.2f} m (calibrate)"))
-        if abs(link.delay) >= 0.05:
-            found.append((2, f"{link.link}: stamps are {link.delay:+.2f} s late (calibrate)"))
         if link.outliers > 0.05 and link.samples >= _MANY:
             share = f"{100 * link.outliers:.0f} %"
             found.append((4, f"{link.link}: {share} of ranges are beyond three deviations"))

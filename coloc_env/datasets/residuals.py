@@ -51,6 +51,12 @@ def links_of(recording: Recording, stream: str) -> list[Link]:
     return found
 
 
+def has_truth(recording: Recording, link: Link) -> bool:
+    """Whether there is truth of both ends of a link."""
+    ends = [link.robot] if link.to_anchor else [link.robot, link.other]
+    return all(len(recording.truth[end].time) > 1 for end in ends)
+
+
 def pose_at(track: Track, time: Stamps) -> tuple[Floats, Floats, Flags]:
     """Position [T, d], attitude [T, a] and where they are known, at some times."""
     zero = track.time[0]

@@ -78,14 +78,14 @@ for warning in report.warnings:
 # %% [markdown]
 # ## Calibrate on one part, score on another
 #
-# `coloc recording calibrate yard --span 0:20` writes `yard/believed.yaml`: deviation, bias and
+# `coloc recording calibrate yard --span 0:30` writes `yard/believed.yaml`: deviation, bias and
 # delay of each link, the odometry's scales, and more.
 
 # %%
 from coloc_env.datasets.noise_model import write_noise_model
 from training.calibration.calibrate import calibrate, part_of
 
-learnt = calibrate(part_of(recording, (0.0, 20.0)))
+learnt = calibrate(part_of(recording, (0.0, 30.0)))
 believed = home / "believed.yaml"
 believed.write_text(write_noise_model(learnt.model))
 ranges = learnt.model.anchor_ranges
@@ -93,7 +93,7 @@ print(f"ranges: σ {ranges.std:.2f} m, {ranges.bias:.2f} m too long, {ranges.del
 print(f"wheels: {learnt.model.odometry.scale:.2f} of what they say")
 
 # %% [markdown]
-# `coloc evaluate replay-v0 --set path=yard --set believed=yard/believed.yaml --set span=20:59
+# `coloc evaluate replay-v0 --set path=yard --set believed=yard/believed.yaml --set span=30:59
 # --agents ekf --out results/yard` on the command line:
 
 # %%
@@ -101,7 +101,7 @@ from coloc_env import make_scenario
 from training.evaluation.evaluate import evaluate
 
 for title, chosen in (("defaults", {}), ("calibrated", {"believed": str(believed)})):
-    scenario = make_scenario("replay-v0", path=str(home), span=(20.0, 59.0), **chosen)
+    scenario = make_scenario("replay-v0", path=str(home), span=(30.0, 59.0), **chosen)
     result = evaluate(scenario, ["ekf"], runs=1, bound=False)
     figures = result.summary["agents"]["ekf"]
     print(f"{title:12s} RMSE {figures['rmse']:.3f} m, NEES {figures['nees']:.1f}")

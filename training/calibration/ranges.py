@@ -6,7 +6,7 @@ import numpy as np
 
 from coloc_env.datasets.noise_model import LinkModel, RangeModel
 from coloc_env.datasets.recording import Recording
-from coloc_env.datasets.residuals import Link, best_delay, links_of, spread, true_ranges
+from coloc_env.datasets.residuals import Link, best_delay, has_truth, links_of, spread, true_ranges
 from training.calibration.noise import Noise, noise_of, pooled, shrunk
 
 _FEW = 3  # ranges of a link that say anything
@@ -18,7 +18,7 @@ def calibrate_ranges(
 ) -> tuple[RangeModel, dict[str, Noise]] | None:
     """The noise model of a stream of ranges and what is known of each link; None where there is
     nothing to learn from."""
-    links = [link for link in links_of(recording, stream) if _has_truth(recording, link)]
+    links = [link for link in links_of(recording, stream) if has_truth(recording, link)]
     common = best_delay(recording, links)
     delays = {link.name: _delay(recording, link, common) for link in links}
     found = {}
@@ -56,8 +56,3 @@ def _delay(recording: Recording, link: Link, common: float) -> float:
     if spread(recording, link, own) < _OWN * spread(recording, link, common):
         return own
     return common
-
-
-def _has_truth(recording: Recording, link: Link) -> bool:
-    ends = [link.robot] if link.to_anchor else [link.robot, link.other]
-    return all(len(recording.truth[end].time) > 1 for end in ends)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from coloc_env.datasets import Recording, Table, Track
 from coloc_env.datasets.check import span_of
-from coloc_env.datasets.residuals import links_of, true_ranges
+from coloc_env.datasets.residuals import has_truth, links_of, true_ranges
 from coloc_env.render.style import MUTED, uav_colours
 from training.evaluation.figures import STYLE
 
@@ -77,8 +77,7 @@ def _errors(axes: Axes, recording: Recording) -> None:
     zero, colours, drawn = span_of(recording)[0], uav_colours(len(recording.robots)), False
     for stream in ("anchor_ranges", "uav_ranges"):
         for link in links_of(recording, stream):
-            ends = [link.robot] if link.to_anchor else [link.robot, link.other]
-            if not all(len(recording.truth[end].time) > 1 for end in ends):
+            if not has_truth(recording, link):
                 continue
             distance, known = true_ranges(recording, link)
             error = (link.measured - distance)[known].clip(-_FARTHEST, _FARTHEST)
