@@ -33,7 +33,9 @@ class Decisions(Transform):
         tensordict_reset.set("score", rows.new_zeros(len(rows), 1))
         return self._with_relations(tensordict_reset)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
         total = score = 0
         for i in range(self.hold):
             if i:

@@ -135,7 +135,9 @@ def task_qmix(
         values, TensorDictModule(mixer, [_CHOSEN, "state"], ["chosen_action_value"]),
         action_space="categorical",
     )  # fmt: skip
-    loss.set_keys(action=_DECIDED, action_value=_VALUES, local_value=_CHOSEN, reward="team_reward")
+    loss.set_keys(
+        action=_DECIDED, action_value=_VALUES, local_value=_CHOSEN, reward="team_reward"
+    )
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
     explore = EGreedyModule(

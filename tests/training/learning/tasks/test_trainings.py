@@ -31,7 +31,8 @@ KINDS: dict[str, tuple[str, Any, dict[str, Any]]] = {
     "held": (
         "task-mappo",
         ppo,
-        _PPO | {"task": "convoy-v0:horizon=10", "moves": "corridor", "hold": 5, "reward": "soft"},
+        _PPO
+        | {"task": "convoy-v0:horizon=10", "moves": "corridor", "hold": 5, "reward": "soft"},
     ),
     "candidates": (
         "task-ippo",
