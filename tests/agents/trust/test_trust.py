@@ -116,7 +116,7 @@ def test_full_trust_is_the_plain_filter(tools: SimpleNamespace) -> None:
     plain = make("ekf:iterations=6", scenario)
     run = tools.play(plain, scenario, [0, 1], 30)
     for logit, tolerance in ((40.0, 0.02), (None, 0.2)):  # standard deviations of the estimate
-        localizer: Any = make("ekf_trust", scenario, weights="none", iterations=6)
+        localizer: Any = make("ekf_trust:bank=false", scenario, weights="none", iterations=6)
         constant(localizer, logit, None if logit is None else -40.0)
         found = tools.replay(localizer, run.observations)
         for one, other in list(zip(found.estimates, run.estimates, strict=True))[10:]:
@@ -128,7 +128,7 @@ def test_full_trust_is_the_plain_filter(tools: SimpleNamespace) -> None:
 
 def test_no_trust_is_the_motion_model(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario, weights="none")
+    localizer: Any = make("ekf_trust:bank=false", scenario, weights="none")
     run = tools.play(localizer, scenario, [0, 1], 6)
     constant(localizer, -200.0, None)
     _, found = localizer.step(run.beliefs[5], run.observations[5])
@@ -141,7 +141,7 @@ def test_no_trust_is_the_motion_model(tools: SimpleNamespace) -> None:
 def test_biases_are_taken_off_ranges(bias: float, tools: SimpleNamespace) -> None:
     """Ranges longer by what the networks always say change nothing."""
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario, weights="none", iterations=1)
+    localizer: Any = make("ekf_trust:bank=false", scenario, weights="none", iterations=1)
     run = tools.play(localizer, scenario, [0, 1], 15)  # known well enough for a single iteration
     longer = 0.2 * torch.nn.functional.softplus(torch.tensor(bias - 4.0))
     seen, estimates = run.observations[14], []
@@ -209,7 +209,7 @@ def test_the_order_of_landmarks_is_the_order_of_their_trust(
     monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace
 ) -> None:
     scenario = make_scenario("indoor-v0", false_matches=0.1, landmarks=12)
-    localizer, seen = watched("ekf_trust", scenario, monkeypatch)
+    localizer, seen = watched("ekf_trust:bank=false", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1], 12)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
 
@@ -247,7 +247,7 @@ def test_a_link_remembers_itself_alone(tools: SimpleNamespace) -> None:
     """Other memories of one link change what becomes of that link's memory, and of no other's; nor
     of another UAV's. (What they change in an estimate is seen in later innovations only.)"""
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario)
+    localizer: Any = make("ekf_trust:bank=false", scenario)
     run = tools.play(localizer, scenario, [0, 1], 5)
     memory = run.beliefs[4].memory
     assert memory.shape[-1] == 1 + PER_LINK * (20 + 6)
@@ -267,7 +267,7 @@ def test_a_link_remembers_itself_alone(tools: SimpleNamespace) -> None:
 
 def test_links_that_are_not_seen_keep_their_memory(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0", landmark_radius=6.0)
-    localizer: Any = make("ekf_trust", scenario)
+    localizer: Any = make("ekf_trust:bank=false", scenario)
     run = tools.play(localizer, scenario, [0, 1], 8)
     links = [b.memory[..., 1 : 1 + 20 * PER_LINK].unflatten(-1, (20, -1)) for b in run.beliefs]
     for k, seen in enumerate(run.observations):
@@ -284,7 +284,7 @@ def test_uavs_that_say_nothing_change_nothing(
 ) -> None:
     """Nine UAVs of which three were never heard estimate as six do."""
     six, nine = (make_scenario("indoor-v0", n_uavs=n, nlos=0.3) for n in (6, 9))
-    run = tools.play(make("ekf_trust", six), six, [0, 1], 10)
+    run = tools.play(make("ekf_trust:bank=false", six), six, [0, 1], 10)
     widths = {"ranges": 1, "range_mask": 1, "messages": 9, "message_mask": 1, "links": 1}
 
     def larger(observation: Observation) -> Observation:
@@ -295,7 +295,7 @@ def test_uavs_that_say_nothing_change_nothing(
             leaves[name] = torch.cat((leaf, leaf[:, :3]), 1)
         return Observation(leaves)
 
-    wide = tools.replay(make("ekf_trust", nine), [larger(o) for o in run.observations])
+    wide = tools.replay(make("ekf_trust:bank=false", nine), [larger(o) for o in run.observations])
     for one, other in zip(wide.estimates, run.estimates, strict=True):
         tools.assert_same(one[:, :6], other, 1e-6)
 
@@ -314,7 +314,7 @@ def test_a_false_match_is_not_trusted_and_honest_ones_are(
 ) -> None:
     """A landmark's vector is another one's. Over 15 worlds: at most 0.03 against 0.91 at least."""
     scenario = make_scenario("indoor-v0")
-    localizer, seen = watched(f"ekf_trust:weights={weights}", scenario, monkeypatch)
+    localizer, seen = watched(f"ekf_trust:bank=false:weights={weights}", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1, 2], 56)
     for k in (10, 30, 55):
         now = run.observations[k]
@@ -337,7 +337,7 @@ def test_a_range_that_went_around_is_not_trusted_and_honest_ones_are(
     mean of 3 worlds, and as little as 0.12 where noise alone makes them 3 σ too long, which nothing
     tells from NLOS. The median without NLOS is 0.88 and 0.80 for the two trainings."""
     scenario = make_scenario("indoor-v0")
-    localizer, seen = watched(f"ekf_trust:weights={weights}", scenario, monkeypatch)
+    localizer, seen = watched(f"ekf_trust:bank=false:weights={weights}", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1, 2], 56)
     whole = torch.cat([trusts[RANGES].weight[blocks[RANGES].mask] for blocks, trusts in seen])
     assert whole.quantile(0.5) > 0.7
@@ -387,5 +387,5 @@ def test_options_that_cannot_be(name: str, chosen: dict, words: str) -> None:
 
 
 def test_the_weights_are_never_trained_by_flying() -> None:
-    localizer: Any = make("ekf_trust", make_scenario("indoor-v0"))
+    localizer: Any = make("ekf_trust:bank=false", make_scenario("indoor-v0"))
     assert not any(p.requires_grad for p in localizer.screen.network.parameters())

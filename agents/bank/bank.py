@@ -1,0 +1,165 @@
+"""A bank of two branches: a classical one, and a learned one that must predict no worse."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from tensordict import TensorClass
+from torch import Tensor
+
+from agents.bank.branches import Branched, copied, twice
+from agents.bank.evidence import BankOptions, accumulated
+from agents.localizer import Estimate, Localizer
+from agents.robust import Capped, RobustScreen
+from agents.tensorclasses import build
+from coloc_env.observation import Observation
+
+
+class BankBelief(TensorClass):
+    """Both branches' beliefs, the ``evidence`` for the candidate (nats), and whether it was
+    restarted from the fallback in the last step; batch (B, N)."""
+
+    fallback: Any
+    candidate: Any
+    evidence: Float64[Tensor, "B N"]
+    restarted: Bool[Tensor, "B N"]
+
+
+class Bank(Localizer[BankBelief]):
+    """A filter twice over, as rows of one batch: with Huber's weights (the fallback), and with
+    those of its own screen capped by Huber's (the candidate).
+
+    Each UAV speaks with the candidate while the evidence A ≥ 0 that this predicts better what is
+    measured; at A < θ the candidate restarts from the fallback with A = 0. What is sent to
+    neighbours is what is spoken, and both branches receive the same.
+    """
+
+    name = "bank"
+
+    def __init__(self, one: Any, options: BankOptions) -> None:
+        """``one``: a filter that weighs its measurements by ``one.screen``, which is replaced."""
+        super().__init__(one.believed)
+        self.name = one.name  # type: ignore[misc]
+        self.filter, self.options = one, options
+        self.process, self.models = one.process, one.models
+        huber = RobustScreen(one.process, one.models, "huber", 0.999)
+        one.screen = Branched(huber, Capped(one.screen), options.degrees)
+
+    @property
+    def exchanges(self) -> bool:
+        return bool(self.filter.exchanges)
+
+    def learn(self, network: Any) -> None:
+        """The candidate judges by this network from now on."""
+        self.filter.screen.candidate.screen.network = network
+
+    def reset(self, observation: Observation) -> BankBelief:
+        one = self.filter.reset(observation)
+        nothing = torch.zeros(one.batch_size, dtype=torch.float64, device=observation.device)
+        return BankBelief(
+            fallback=one,
+            candidate=one.clone(),
+            evidence=nothing,
+            restarted=nothing > 0,
+            batch_size=one.batch_size,
+        )
+
+    def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
+        after, (theirs, ours) = self.branches(belief, observation)
+        speaks = self.speaks(after)
+        estimate = chosen(speaks, ours, theirs)
+        restarted = after.evidence < self.options.restart
+        return build(
+            BankBelief,
+            after.batch_size,
+            fallback=after.fallback,
+            candidate=copied(restarted, after.fallback, after.candidate),
+            evidence=after.evidence.masked_fill(restarted, 0.0),
+            restarted=restarted,
+        ), estimate
+
+    def branches(
+        self, belief: BankBelief, observation: Observation
+    ) -> tuple[BankBelief, tuple[Estimate, Estimate]]:
+        """Both branches a step on, the evidence with that step's, and both estimates."""
+        rows = torch.cat((belief.fallback, belief.candidate))
+        rows, estimates = self.filter.step(rows, twice(observation))
+        b = len(rows) // 2
+        fallback, candidate = rows[:b], rows[b:]
+        after = build(
+            BankBelief,
+            belief.batch_size,
+            fallback=fallback,
+            candidate=candidate,
+            evidence=accumulated(
+                belief.evidence,
+                candidate.memory[..., -1],
+                fallback.memory[..., -1],
+                self.options.forgetting,
+            ),
+            restarted=torch.zeros_like(belief.restarted),
+        )
+        return after, (estimates[:b], estimates[b:])
+
+    def speaks(self, belief: BankBelief) -> Bool[Tensor, "B N"]:
+        """Where the candidate is the one that speaks (or spoke in the last step)."""
+        return (belief.evidence >= 0) & ~belief.restarted
+
+    def mean(self, belief: BankBelief) -> Float[Tensor, "B N S"]:
+        ours, theirs = (self.filter.mean(one) for one in (belief.candidate, belief.fallback))
+        return torch.where(self.speaks(belief).unsqueeze(-1), ours, theirs)
+
+    def shifted(self, belief: BankBelief, offset: Float[Tensor, "B N d"]) -> BankBelief:
+        return belief.replace(
+            fallback=self.filter.shifted(belief.fallback, offset),
+            candidate=self.filter.shifted(belief.candidate, offset),
+        )
+
+    def gaussian(
+        self, belief: BankBelief, observation: Observation
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
+        (x, p), (fallback, own) = (
+            self.filter.gaussian(one, observation) for one in (belief.candidate, belief.fallback)
+        )
+        speaks = self.speaks(belief).unsqueeze(-1)
+        return torch.where(speaks, x, fallback), torch.where(speaks.unsqueeze(-1), p, own)
+
+    def restart_from(
+        self,
+        belief: BankBelief,
+        rows: Bool[Tensor, "B N"],
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+    ) -> BankBelief:
+        return belief.replace(
+            fallback=self.filter.restart_from(belief.fallback, rows, state, covariance),
+            candidate=self.filter.restart_from(belief.candidate, rows, state, covariance),
+            evidence=belief.evidence.masked_fill(rows, 0.0),
+        )
+
+    def diagnostics(self, belief: BankBelief) -> dict[str, Float[Tensor, "B N"]]:
+        speaks = self.speaks(belief)
+        ours, theirs = (self.filter.diagnostics(one) for one in (belief.candidate, belief.fallback))
+        spoken = {name: torch.where(speaks, ours[name], theirs[name]) for name in ours}
+        return spoken | {
+            "trust_share": speaks.float(),
+            "huber_share": (~speaks).float(),
+            "restarts_per_run": belief.restarted.float(),
+        }
+
+
+def chosen(rows: Bool[Tensor, "B N"], ours: Estimate, theirs: Estimate) -> Estimate:
+    """Estimates of the UAVs in ``rows`` from the former, of the others from the latter."""
+    row = rows.unsqueeze(-1)
+    return build(
+        Estimate,
+        rows.shape,
+        position=torch.where(row, ours.position, theirs.position),
+        velocity=torch.where(row, ours.velocity, theirs.velocity),
+        covariance=torch.where(row.unsqueeze(-1), ours.covariance, theirs.covariance),
+    )
+
+
+def learned_branch(belief: BankBelief) -> Any:
+    """The candidate's belief as its filter alone holds it: its screen's own memory."""
+    return belief.candidate.replace(memory=belief.candidate.memory[..., :-1])
