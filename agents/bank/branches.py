@@ -116,7 +116,7 @@ def _half(blocks: Sequence[Block], half: int) -> list[Block]:
 
 
 def _rows(block: Block, half: int) -> Block:
-    parts = {
+    parts: dict[str, Any] = {
         field.name: value.chunk(2)[half]
         for field in fields(block)
         if isinstance(value := getattr(block, field.name), Tensor)

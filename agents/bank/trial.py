@@ -19,7 +19,7 @@ _OPEN = 1.0  # nats: evidence below which another restart may take the place of 
 class Trial(Bank):
     """A filter that is restarted only by what has predicted better than itself.
 
-    What it is restarted from becomes the candidate, with A = 0. At A > 2 this has taken the filter's
+    What it is restarted from becomes the candidate, with A = 0. At A > 2 this takes the filter's
     place, and speaks; at A < θ the trial is over. Both branches have Huber's weights at most.
     """
 

@@ -160,8 +160,8 @@ class HybridFilter(Localizer[HybridBelief]):
         seen: Evidence,
         observation: Observation,
     ) -> Bool[Tensor, "B N"]:
-        """Whether the auxiliary's position is known about as well in all directions (condition), and
-        leaves less of what is measured now than the main filter's (cost)."""
+        """Whether the auxiliary's position is known about as well in all directions (condition),
+        and leaves less of what is measured now than the main filter's (cost)."""
         variances = torch.linalg.eigvalsh(covariance)
         posed = (variances[..., 0] > 0) & (variances[..., -1] < _ILL**2 * variances[..., 0])
         where = state if self.model.tags else state[..., : self.process.dim]

@@ -53,7 +53,7 @@ class TrustNetwork(Learned):
     """
 
     kind = "trust"
-    features = SHARED + SIGNED
+    features: tuple[str, ...] = SHARED + SIGNED
 
     def __init__(self, relative: bool = False) -> None:
         super().__init__()
@@ -87,5 +87,7 @@ class TrustNetwork(Learned):
         made.load_state_dict(other.state_dict())
         with torch.no_grad():
             for layers, std in ((made.vectors, vectors), (made.ranges, ranges)):
-                layers[0].bias += layers[0].weight[:, SHARED.index("own_std")] * math.log(std)
+                first = layers[0]
+                assert isinstance(first, nn.Linear)
+                first.bias += first.weight[:, SHARED.index("own_std")] * math.log(std)
         return made

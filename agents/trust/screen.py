@@ -133,8 +133,8 @@ def learned_screen(
     bank: bool,
     options: dict[str, Any],
 ) -> TrustScreen:
-    """The screen that judges by a checkpoint's networks, and by nothing beside them; ``auto``: those
-    trained for a ``bank``, or for use alone."""
+    """The screen that judges by a checkpoint's networks, and by nothing beside them; ``auto``:
+    those trained for a ``bank``, or for use alone."""
     if options.get("robust", "none") != "none":
         raise ValueError("robust is not allowed beside learned trust: none")
     if weights == "auto":

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.recordings import recordings
 from training.cli.render import render
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
@@ -65,6 +66,7 @@ for _command in (
     scenarios,
     agents,
     tasks,
+    recordings,
     render,
     bench,
     train,
