@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float, Float64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.bank.branches import Branched, copied, twice
+from agents.bank.branches import Branched, copied, halves, stacked, twice
 from agents.bank.evidence import BankOptions, accumulated
 from agents.localizer import Estimate, Localizer
-from agents.robust import Capped, RobustScreen
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 
@@ -42,8 +41,7 @@ class Bank(Localizer[BankBelief]):
         self.name = one.name  # type: ignore[misc]
         self.filter, self.options = one, options
         self.process, self.models = one.process, one.models
-        huber = RobustScreen(one.process, one.models, "huber", 0.999)
-        one.screen = Branched(huber, Capped(one.screen), options.degrees)
+        one.screen = Branched(one.screen, options.degrees)
 
     @property
     def exchanges(self) -> bool:
@@ -51,7 +49,7 @@ class Bank(Localizer[BankBelief]):
 
     def learn(self, network: Any) -> None:
         """The candidate judges by this network from now on."""
-        self.filter.screen.candidate.screen.network = network
+        self.filter.screen.candidate.network = network
 
     def reset(self, observation: Observation) -> BankBelief:
         one = self.filter.reset(observation)
@@ -82,10 +80,9 @@ class Bank(Localizer[BankBelief]):
         self, belief: BankBelief, observation: Observation
     ) -> tuple[BankBelief, tuple[Estimate, Estimate]]:
         """Both branches a step on, the evidence with that step's, and both estimates."""
-        rows = torch.cat((belief.fallback, belief.candidate))
+        rows = stacked(belief.fallback, belief.candidate)
         rows, estimates = self.filter.step(rows, twice(observation))
-        b = len(rows) // 2
-        fallback, candidate = rows[:b], rows[b:]
+        fallback, candidate = halves(rows)
         after = build(
             BankBelief,
             belief.batch_size,
@@ -99,7 +96,7 @@ class Bank(Localizer[BankBelief]):
             ),
             restarted=torch.zeros_like(belief.restarted),
         )
-        return after, (estimates[:b], estimates[b:])
+        return after, halves(estimates)
 
     def speaks(self, belief: BankBelief) -> Bool[Tensor, "B N"]:
         """Where the candidate is the one that speaks (or spoke in the last step)."""

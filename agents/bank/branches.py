@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,88 +11,97 @@ from torch import Tensor
 from agents.bank.evidence import predictive_score
 from agents.models.measurements import Block
 from agents.robust import Prediction, Screen, Trust
+from agents.robust.capped import capped
+from agents.robust.huber import huber_weights
+from agents.tensorclasses import build
 from coloc_env.observation import Observation
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Judgements:
-    """Both screens' evidence about their rows, and the predictive score of all rows."""
+class Judgement:
+    """The candidate's evidence about its rows, and the predictive score of all."""
 
-    fallback: Any
     candidate: Any
     score: Float[Tensor, "B N"]
 
 
 class Branched(Screen):
-    """Two screens on a batch of twice as many worlds: ``fallback`` judges the first half of the
-    rows, ``candidate`` the second.
+    """Screen of a batch of twice as many worlds: Huber's weights in the first half of the rows (the
+    fallback), another screen's, capped by Huber's, in the second (the candidate).
 
-    The memory holds what either remembers, and in its last column the predictive score of the last
-    step's measurements.
+    While an update iterates, Huber's weights stand in for both. The memory holds the candidate's
+    (zeros in the fallback), and in its last column the predictive score of the last step's
+    measurements.
     """
 
-    def __init__(self, fallback: Screen, candidate: Screen, degrees: float) -> None:
+    extra = 3  # as Huber's weights alone have
+
+    def __init__(self, candidate: Screen, degrees: float) -> None:
         super().__init__(candidate.process, candidate.models)
-        self.fallback, self.candidate, self.degrees = fallback, candidate, degrees
-        self.exchanges = fallback.exchanges or candidate.exchanges
-        self.extra = max(fallback.extra, candidate.extra)
+        self.candidate, self.degrees = candidate, degrees
+        self.exchanges = candidate.exchanges
+        self.extra = max(self.extra, candidate.extra)
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
-        own = (screen.memory(observation) for screen in (self.fallback, self.candidate))
-        return torch.cat((*own, observation["prior"][..., :1] * 0.0), -1)
+        return torch.cat(
+            (self.candidate.memory(observation), observation["prior"][..., :1] * 0.0), -1
+        )
 
-    def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Judgements:
-        first, second = self._apart(prediction)
-        return Judgements(
-            self.fallback.judge(_half(blocks, 0), first),
-            self.candidate.judge(_half(blocks, 1), second),
+    def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Judgement:
+        return Judgement(
+            self.candidate.judge(_second(blocks), _of_candidate(prediction)),
             predictive_score(blocks, prediction.covariance, self.degrees),
         )
 
-    def weigh(self, blocks: Sequence[Block], evidence: Judgements, last: bool) -> list[Trust]:
-        first = self.fallback.weigh(_half(blocks, 0), evidence.fallback, last)
-        second = self.candidate.weigh(_half(blocks, 1), evidence.candidate, last)
+    def weigh(self, blocks: Sequence[Block], evidence: Judgement, last: bool) -> list[Trust]:
+        huber = [huber_weights(block) for block in blocks]
+        if not last:
+            return [Trust(weight) for weight in huber]
+        halves = [weight.chunk(2) for weight in huber]
+        trusts = self.candidate.weigh(_second(blocks), evidence.candidate, last)
+        trusts = capped([half[1] for half in halves], trusts)
         return [
-            Trust(_joined(a.weight, b.weight, 1.0), _joined(a.shift, b.shift, 0.0))
-            for a, b in zip(first, second, strict=True)
+            Trust(torch.cat((half[0], t.weight)), _after_zeros(t.shift))
+            for half, t in zip(halves, trusts, strict=True)
+            if t.weight is not None
         ]
 
     def remember(
         self,
         prediction: Prediction,
-        evidence: Judgements,
+        evidence: Judgement,
         after: Callable[[], Sequence[Block]],
     ) -> Float[Tensor, "B N K"]:
-        first, second = self._apart(prediction)
-        one = self.fallback.remember(first, evidence.fallback, lambda: _half(after(), 0))
-        other = self.candidate.remember(second, evidence.candidate, lambda: _half(after(), 1))
-        rows = (
-            torch.cat((one, torch.zeros_like(other)), -1),
-            torch.cat((torch.zeros_like(one), other), -1),
+        own = self.candidate.remember(
+            _of_candidate(prediction), evidence.candidate, lambda: _second(after())
         )
-        return torch.cat((torch.cat(rows), evidence.score.unsqueeze(-1)), -1).to(prediction.memory)
-
-    def _apart(self, prediction: Prediction) -> tuple[Prediction, Prediction]:
-        """Both halves, each with its own screen's memory."""
-        size = self.fallback.memory(prediction.observation).shape[-1]
-        columns = slice(0, size), slice(size, -1)
-        b = len(prediction.state) // 2
-        rows = slice(0, b), slice(b, None)
-        first, second = (
-            Prediction(
-                prediction.state[row],
-                prediction.covariance[row],
-                Observation({k: leaf[row] for k, leaf in prediction.observation.leaves.items()}),
-                prediction.memory[row][..., column],
-            )
-            for row, column in zip(rows, columns, strict=True)
-        )
-        return first, second
+        rows = torch.cat((torch.zeros_like(own), own))
+        return torch.cat((rows, evidence.score.unsqueeze(-1)), -1).to(prediction.memory)
 
 
 def twice(observation: Observation) -> Observation:
     """What both branches observe: the same."""
     return Observation({k: torch.cat((leaf, leaf)) for k, leaf in observation.leaves.items()})
+
+
+def stacked(first: T, second: T) -> T:
+    """Two tensorclasses of batch (B, N) as the rows of one."""
+    parts = {k: torch.cat((value, getattr(second, k))) for k, value in first.items()}  # type: ignore[attr-defined]
+    shape = first.batch_size  # type: ignore[attr-defined]
+    return build(type(first), torch.Size((2 * shape[0], *shape[1:])), **parts)
+
+
+def halves(rows: T) -> tuple[T, T]:
+    """The two that ``stacked`` made one."""
+    shape = rows.batch_size  # type: ignore[attr-defined]
+    b = shape[0] // 2
+    first, second = (
+        build(type(rows), torch.Size((b, *shape[1:])), **{k: v[part] for k, v in rows.items()})  # type: ignore[attr-defined]
+        for part in (slice(0, b), slice(b, None))
+    )
+    return first, second
 
 
 def copied(rows: Bool[Tensor, "B N"], source: Any, into: Any) -> Any:
@@ -110,24 +119,27 @@ def copied(rows: Bool[Tensor, "B N"], source: Any, into: Any) -> Any:
     return into.replace(**parts)
 
 
-def _half(blocks: Sequence[Block], half: int) -> list[Block]:
-    """The blocks of the first (0) or second (1) half of the rows."""
-    return [_rows(block, half) for block in blocks]
+def _of_candidate(prediction: Prediction) -> Prediction:
+    """The candidate's rows, with its own memory."""
+    b = len(prediction.state) // 2
+    seen = {k: leaf[b:] for k, leaf in prediction.observation.leaves.items()}
+    memory = prediction.memory[b:, :, :-1]
+    return Prediction(prediction.state[b:], prediction.covariance[b:], Observation(seen), memory)
 
 
-def _rows(block: Block, half: int) -> Block:
+def _second(blocks: Sequence[Block]) -> list[Block]:
+    """The second half of each block's rows."""
+    return [_second_half(block) for block in blocks]
+
+
+def _second_half(block: Block) -> Block:
     parts: dict[str, Any] = {
-        field.name: value.chunk(2)[half]
+        field.name: value[len(value) // 2 :]
         for field in fields(block)
         if isinstance(value := getattr(block, field.name), Tensor)
     }
     return replace(block, **parts)
 
 
-def _joined(one: Tensor | None, other: Tensor | None, blank: float) -> Tensor | None:
-    """Two halves' weights or shifts, ``blank`` where a half has none."""
-    like = one if other is None else other
-    if like is None:
-        return None
-    parts = (torch.full_like(like, blank) if part is None else part for part in (one, other))
-    return torch.cat(tuple(parts))
+def _after_zeros(shift: Tensor | None) -> Tensor | None:
+    return None if shift is None else torch.cat((torch.zeros_like(shift), shift))

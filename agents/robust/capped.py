@@ -13,9 +13,18 @@ from agents.robust.screen import Prediction, Screen, Trust
 from coloc_env.observation import Observation
 
 
+def capped(weights: Sequence[Float[Tensor, "B N m"]], trusts: Sequence[Trust]) -> list[Trust]:
+    """min(w, weight) of each block's weights; shifts stay."""
+    return [
+        Trust(w if t.weight is None else torch.minimum(w, t.weight), t.shift)
+        for w, t in zip(weights, trusts, strict=True)
+    ]
+
+
 class Capped(Screen):
     """min(w_Huber, w) of another screen's weights w: it may doubt what Huber's weights believe, and
-    believes nothing that they doubt."""
+    believes nothing that they doubt. While an update iterates, Huber's weights stand in for both.
+    """
 
     def __init__(self, screen: Screen) -> None:
         super().__init__(screen.process, screen.models)
@@ -29,11 +38,10 @@ class Capped(Screen):
         return self.screen.judge(blocks, prediction)
 
     def weigh(self, blocks: Sequence[Block], evidence: Any, last: bool) -> list[Trust]:
-        trusts = self.screen.weigh(blocks, evidence, last)
-        pairs = zip(map(huber_weights, blocks), trusts, strict=True)
-        return [
-            Trust(w if t.weight is None else torch.minimum(w, t.weight), t.shift) for w, t in pairs
-        ]
+        huber = [huber_weights(block) for block in blocks]
+        if not last:
+            return [Trust(weight) for weight in huber]
+        return capped(huber, self.screen.weigh(blocks, evidence, last))
 
     def remember(
         self, prediction: Prediction, evidence: Any, after: Callable[[], Sequence[Block]]

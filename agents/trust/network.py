@@ -89,5 +89,5 @@ class TrustNetwork(Learned):
             for layers, std in ((made.vectors, vectors), (made.ranges, ranges)):
                 first = layers[0]
                 assert isinstance(first, nn.Linear)
-                first.bias += first.weight[:, SHARED.index("own_std")] * math.log(std)
+                first.bias.add_(first.weight[:, SHARED.index("own_std")], alpha=math.log(std))
         return made

@@ -25,7 +25,7 @@ def recordings(
     runs: Annotated[int, typer.Option(help="Draws of the prior, seeded SEED, SEED + 1, …")] = 3,
     seed: Seed = 0,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the table and all figures as JSON.")
+        Path | None, typer.Option(metavar="FILE", help="Write the table as JSON.")
     ] = None,
     threads: Threads = 1,
     data: Data = None,

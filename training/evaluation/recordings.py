@@ -105,7 +105,7 @@ def table(
     command: str,
     provenance: str,
 ) -> dict[str, Any]:
-    """A measured table (``docs/results/measured``): a line a recording, and the ``figures``."""
+    """A measured table (``docs/results/measured``): a line a recording."""
     rows = []
     for name, by_agent in figures.items():
         known = [by_agent[agent] for agent in CLASSICAL if "rmse" in by_agent.get(agent, {})]
@@ -122,7 +122,6 @@ def table(
         "header": ["", *(f"`{agent}`" for agent in agents)],
         "align": ["left", *["right"] * len(agents)],
         "rows": rows,
-        "figures": figures,
     }
 
 

@@ -41,8 +41,8 @@ from training.learning.collectors import (
 from training.learning.run import Progress, Training, make_trainer
 
 # What the networks meet: each difficulty alone, all at once, nothing at all; and ranges unlike
-# those of the room: to anchors alone, by a motion model without IMU, with gross errors both ways, heavy
-# tails, drop-outs, and noise that the team is wrong about.
+# those of the room: to anchors alone, by a motion model without IMU, with gross errors both ways,
+# heavy tails, drop-outs, and noise that the team is wrong about.
 VARIANTS = (
     "",
     "nlos=0.3",
@@ -151,8 +151,8 @@ def trust(
     In each of ``epochs`` epochs ``worlds`` new worlds of every variant of ``scenario`` (clean,
     NLOS, false matches, few landmarks, uniform prior, anchors alone, ranges unlike what is
     believed, combinations) are run with the newest weights, in turn by the filter alone and by its
-    bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through the learned
-    filter. The learning rate falls linearly to a twentieth. ``start``: the checkpoint whose weights
+    bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through
+    the learned filter. The learning rate falls linearly to a twentieth. ``start``: the checkpoint whose weights
     it starts from (``none``: random ones).
     ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
     """
