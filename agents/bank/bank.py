@@ -63,40 +63,28 @@ class Bank(Localizer[BankBelief]):
         )
 
     def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
-        after, (theirs, ours) = self.branches(belief, observation)
-        speaks = self.speaks(after)
-        estimate = chosen(speaks, ours, theirs)
-        restarted = after.evidence < self.options.restart
-        return build(
-            BankBelief,
-            after.batch_size,
-            fallback=after.fallback,
-            candidate=copied(restarted, after.fallback, after.candidate),
-            evidence=after.evidence.masked_fill(restarted, 0.0),
-            restarted=restarted,
-        ), estimate
-
-    def branches(
-        self, belief: BankBelief, observation: Observation
-    ) -> tuple[BankBelief, tuple[Estimate, Estimate]]:
-        """Both branches a step on, the evidence with that step's, and both estimates."""
-        rows = stacked(belief.fallback, belief.candidate)
-        rows, estimates = self.filter.step(rows, twice(observation))
-        fallback, candidate = halves(rows)
+        fallback, candidate, evidence, estimates = self.branches(belief, observation)
+        restarted = evidence < self.options.restart
         after = build(
             BankBelief,
             belief.batch_size,
             fallback=fallback,
-            candidate=candidate,
-            evidence=accumulated(
-                belief.evidence,
-                candidate.memory[..., -1],
-                fallback.memory[..., -1],
-                self.options.forgetting,
-            ),
-            restarted=torch.zeros_like(belief.restarted),
+            candidate=copied(restarted, fallback, candidate),
+            evidence=evidence.masked_fill(restarted, 0.0),
+            restarted=restarted,
         )
-        return after, halves(estimates)
+        return after, spoken(evidence >= 0, estimates)
+
+    def branches(
+        self, belief: BankBelief, observation: Observation
+    ) -> tuple[Any, Any, Float64[Tensor, "B N"], Estimate]:
+        """A step of both branches: their beliefs (the fallback's first), the evidence with that
+        step's, and the estimates of both as rows, first the fallback's."""
+        rows = stacked(belief.fallback, belief.candidate)
+        rows, estimates = self.filter.step(rows, twice(observation))
+        theirs, ours = rows.memory[..., -1].chunk(2)
+        evidence = accumulated(belief.evidence, ours, theirs, self.options.forgetting)
+        return *halves(rows), evidence, estimates
 
     def speaks(self, belief: BankBelief) -> Bool[Tensor, "B N"]:
         """Where the candidate is the one that speaks (or spoke in the last step)."""
@@ -145,16 +133,15 @@ class Bank(Localizer[BankBelief]):
         }
 
 
-def chosen(rows: Bool[Tensor, "B N"], ours: Estimate, theirs: Estimate) -> Estimate:
-    """Estimates of the UAVs in ``rows`` from the former, of the others from the latter."""
-    row = rows.unsqueeze(-1)
-    return build(
-        Estimate,
-        rows.shape,
-        position=torch.where(row, ours.position, theirs.position),
-        velocity=torch.where(row, ours.velocity, theirs.velocity),
-        covariance=torch.where(row.unsqueeze(-1), ours.covariance, theirs.covariance),
-    )
+def spoken(candidate: Bool[Tensor, "B N"], estimates: Estimate) -> Estimate:
+    """The estimates of the second half of the rows where the ``candidate`` speaks, those of the
+    first elsewhere."""
+    parts = {}
+    for name in ("position", "velocity", "covariance"):
+        theirs, ours = estimates.get(name).chunk(2)
+        speaks = candidate.reshape(*candidate.shape, *[1] * (ours.ndim - 2))
+        parts[name] = torch.where(speaks, ours, theirs)
+    return build(Estimate, candidate.shape, **parts)
 
 
 def learned_branch(belief: BankBelief) -> Any:

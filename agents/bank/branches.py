@@ -50,9 +50,11 @@ class Branched(Screen):
         )
 
     def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Judgement:
+        pairs = zip(self.models, blocks, strict=True)
+        measured = [block for model, block in pairs if model.testable]
         return Judgement(
             self.candidate.judge(_second(blocks), _of_candidate(prediction)),
-            predictive_score(blocks, prediction.covariance, self.degrees),
+            predictive_score(measured, prediction.covariance, self.degrees),
         )
 
     def weigh(self, blocks: Sequence[Block], evidence: Judgement, last: bool) -> list[Trust]:

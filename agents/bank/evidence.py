@@ -38,7 +38,7 @@ def predictive_score(
     """ℓ = Σ −½ log|S| − ½ (ν + k) log(1 + d²/ν) over all that was measured, S = H P Hᵀ + R and
     d² = rᵀ S⁻¹ r: log of Student's t of the innovations, without what no filter changes. ``blocks``
     are linearized at the prediction, whose covariance P is."""
-    total = torch.zeros_like(covariance[..., 0, 0])
+    total = covariance.new_zeros(covariance.shape[:-2])
     for block in blocks:
         terms, pivots = innovation_terms(block, covariance)
         k = len(terms)

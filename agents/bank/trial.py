@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.bank.bank import Bank, BankBelief, chosen
+from agents.bank.bank import Bank, BankBelief, spoken
 from agents.bank.branches import copied
 from agents.localizer import Estimate
 from agents.tensorclasses import build
@@ -24,17 +24,18 @@ class Trial(Bank):
     """
 
     def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
-        after, (theirs, ours) = self.branches(belief, observation)
-        better, worse = after.evidence > _BETTER, after.evidence < self.options.restart
-        fallback = copied(better, after.candidate, after.fallback)
-        return build(
+        fallback, candidate, evidence, estimates = self.branches(belief, observation)
+        better, worse = evidence > _BETTER, evidence < self.options.restart
+        fallback = copied(better, candidate, fallback)
+        after = build(
             BankBelief,
-            after.batch_size,
+            belief.batch_size,
             fallback=fallback,
-            candidate=copied(worse, fallback, after.candidate),
-            evidence=after.evidence.masked_fill(better | worse, 0.0),
+            candidate=copied(worse, fallback, candidate),
+            evidence=evidence.masked_fill(better | worse, 0.0),
             restarted=better,
-        ), chosen(better, ours, theirs)
+        )
+        return after, spoken(better, estimates)
 
     def speaks(self, belief: BankBelief) -> Bool[Tensor, "B N"]:
         """Nowhere: a candidate that is better has become the filter itself."""

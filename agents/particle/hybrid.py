@@ -11,7 +11,6 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.bank import BankOptions, Trial
-from agents.bank.bank import chosen
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
@@ -115,13 +114,13 @@ class HybridFilter(Localizer[HybridBelief]):
                 rows = rows & self._sound(state, spread, seen, observation)
             main = self.main.restart_from(main, rows, state, covariance)
             if not self.on_trial:
-                there = Estimate(
-                    position=state[..., :d].to(like),
-                    velocity=state[..., d : 2 * d].to(like),
-                    covariance=spread,
+                row = rows.unsqueeze(-1)
+                estimate = Estimate(
+                    position=torch.where(row, state[..., :d].to(like), like),
+                    velocity=torch.where(row, state[..., d : 2 * d].to(like), estimate.velocity),
+                    covariance=torch.where(row.unsqueeze(-1), spread, estimate.covariance),
                     batch_size=rows.shape,
                 )
-                estimate = chosen(rows, there, estimate)
         after = build(
             HybridBelief,
             rows.shape,

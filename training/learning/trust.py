@@ -152,8 +152,8 @@ def trust(
     NLOS, false matches, few landmarks, uniform prior, anchors alone, ranges unlike what is
     believed, combinations) are run with the newest weights, in turn by the filter alone and by its
     bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through
-    the learned filter. The learning rate falls linearly to a twentieth. ``start``: the checkpoint whose weights
-    it starts from (``none``: random ones).
+    the learned filter. The learning rate falls linearly to a twentieth. ``start``: the checkpoint
+    whose weights it starts from (``none``: random ones).
     ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
     """
     scenarios = [parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
