@@ -5,7 +5,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from agents.tasks.gains import log_gain
-from agents.tasks.task import Task, TaskMemory, own_sigma
+from agents.tasks.memory import TaskMemory, own_sigma
+from agents.tasks.task import Task
 
 WIDTH = 14
 _NEAR = 1.5  # times the reach: who may disturb each other

@@ -7,7 +7,8 @@ from agents.policies.decisions import relations
 from agents.policies.moves import table
 from agents.policies.task_actor import TaskActor
 from agents.tasks.registry import make_task
-from agents.tasks.task import Seen, Task
+from agents.tasks.rules import Seen
+from agents.tasks.task import Task
 from agents.weights import learned
 
 

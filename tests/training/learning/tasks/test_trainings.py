@@ -31,8 +31,7 @@ KINDS: dict[str, tuple[str, Any, dict[str, Any]]] = {
     "held": (
         "task-mappo",
         ppo,
-        _PPO
-        | {"task": "convoy-v0:horizon=10", "moves": "corridor", "hold": 5, "reward": "soft"},
+        _PPO | {"task": "convoy-v0:horizon=10", "moves": "corridor", "hold": 5, "reward": "soft"},
     ),
     "candidates": (
         "task-ippo",
