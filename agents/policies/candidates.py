@@ -18,8 +18,8 @@ def candidates(task: Task, memory: TaskMemory) -> Float32[Tensor, "B n C K"]:
     Own and the team's predicted gain; whether the gain is the UAV's own best; how its best compares
     to those of all who may disturb it, and whether it is the largest there (ties: the lower number
     has it); the same of the team's gain, beside those of whose exchanges would spoil this one or be
-    spoiled by it; how many UAVs are near the caller and near the one called; distance; σ of both; whether
-    it is a call at all.
+    spoiled by it; how many UAVs are near the caller and near the one called; distance; σ of both;
+    whether it is a call at all.
     """
     n, more = task.n_agents, memory.more
     gain, team = more["gain"], more["team_gain"]  # [B, n, C − 1]

@@ -1,4 +1,4 @@
-"""Decisions of a learned policy in a task: what it reads, and the actions that choices stand for."""
+"""Decisions of a learned policy in a task: what it reads, and what its choices stand for."""
 
 import torch
 from jaxtyping import Float32

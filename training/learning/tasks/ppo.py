@@ -270,9 +270,9 @@ def task_mappo(**options: Any) -> Training:
     them) from their start to the horizon and learns from them in ``passes`` passes. ``network``:
     recurrent, graph attention over neighbours, or one that scores each candidate exchange.
     ``moves``: choices in place of velocities; ``hold``: for how many steps each decision is held.
-    ``difference``: each call is rewarded by what it was worth to the team; a task's own option
-    ``reward=sigma`` rewards the filter's σ in place of the true error. Learning rate and entropy bonus fall linearly. At the end the policy
-    meets ``score_worlds`` of the protocol's worlds.
+    ``difference``: each call is rewarded by what it was worth to the team; the task's own option
+    ``reward=sigma`` rewards the filter's σ in place of the true error. Learning rate and entropy
+    bonus fall linearly. At the end the policy meets ``score_worlds`` of the protocol's worlds.
     """
     return _ppo("task-mappo", MAPPOLoss, **options)
 
