@@ -41,7 +41,7 @@ class TaskPolicy:
 
     def _decide(self, seen: Seen) -> Tensor:
         training, actor = self.actor.training, self.actor.eval()
-        more = relations(self.task, seen.memory, actor.network)
+        more = relations(seen.task, seen.memory, actor.network)
         out, self._memory = actor(seen.observation, seen.mask, more, self._memory)
         actor.train(training)
         if not actor.discrete:
