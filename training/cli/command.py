@@ -13,7 +13,8 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
-from training.cli.recording import recording, recordings
+from training.cli.recording import recording
+from training.cli.recordings import recordings
 from training.cli.render import render
 from training.cli.report import report
 from training.cli.reproduce import reproduce
@@ -68,8 +69,8 @@ for _command in (
     score,
     scenarios,
     agents,
-    recordings,
     tasks,
+    recordings,
     render,
     view,
     bench,

@@ -1,4 +1,4 @@
-"""``coloc recordings`` and ``coloc recording``: known recordings, and those of one's own."""
+"""``coloc recording``: recordings of one's own."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,29 +33,6 @@ recording = typer.Typer(
 Folder = Annotated[
     Path, typer.Argument(metavar="DIR", help="A folder in the open recording format.")
 ]
-
-
-def recordings(data: Data = None) -> None:
-    """List the recordings that are known, and which of their sequences are here.
-
-    **Examples**
-
-    coloc recordings
-
-    coloc recordings --data ~/recordings
-    """
-    from coloc_env.datasets import DATASETS, sequences
-    from coloc_env.datasets.folders import HOMES
-
-    lines = []
-    for name in DATASETS:
-        try:
-            found = sequences(name, data)
-        except ValueError:
-            found = ()
-        lines.append([f"replay-{name}-v0", ", ".join(found) or f"not here: {HOMES[name]}"])
-    show(["scenario", "sequences"], lines)
-    typer.echo("--set sequence=NAME chooses one; your own: coloc recording --help")
 
 
 @recording.command()

@@ -1,6 +1,7 @@
 """Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -102,6 +103,16 @@ def innovation_rows(results: Evaluation) -> list[list[str]]:
             shown = (short(own["nis"]), " to ".join(band), short(own["whiteness"]), f"± {white}")
             lines.append([name, sensor or "–", *shown, short(own["rejected"]), *ends])
     return lines
+
+
+def html_table(results: Evaluation) -> str:
+    """The main table as notebooks show it."""
+    lines = [["", *COLUMNS.values()], *rows(results)]
+    cells = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in line)
+        for line, tag in zip(lines, ["th", *["td"] * (len(lines) - 1)], strict=True)
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in cells) + "</table>"
 
 
 def left_out(results: Evaluation) -> str:

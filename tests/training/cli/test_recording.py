@@ -67,10 +67,3 @@ def test_a_spreadsheets_folder_is_checked(tmp_path: Path) -> None:
     done = coloc("recording", "check", str(write(tmp_path, spreadsheet())))
     assert done.exit_code == 0, done.output
     assert "not used: column note" in done.output
-
-
-def test_recordings_are_listed(tmp_path: Path) -> None:
-    done = coloc("recordings", "--data", str(tmp_path))
-    assert done.exit_code == 0, done.output
-    assert "replay-miluv-v0" in done.stdout
-    assert "not here: https://github.com/decargroup/miluv" in done.stdout
