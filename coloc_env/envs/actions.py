@@ -7,6 +7,7 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -58,12 +59,12 @@ class ActionMode(ABC):
         """Lowest and highest numbers of one UAV's action: ±1 for each axis."""
         return [-1.0] * self.dim, [1.0] * self.dim
 
-    @property
+    @cached_property
     def width(self) -> int:
         """How many numbers one UAV's action has."""
         return 1 if self.choices else len(self.bounds[0])
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Shape of one UAV's action."""
         return () if self.choices else (self.width,)
@@ -131,7 +132,7 @@ class Estimates(ActionMode):
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
     ) -> tuple[None, Float32[Tensor, "B N A"]]:
-        return None, action[..., : 3 * self.dim]
+        return None, action[..., : 3 * self.dim] if self.largest else action
 
     def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
         return Commands(action[..., 3 * self.dim :] if self.largest else None)

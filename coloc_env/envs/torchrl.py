@@ -149,9 +149,7 @@ class CoLocEnv(EnvBase):
             out.set("state", self._runner.state())
             return out
         observation = out["uav", "observation"]
-        messages, heard = self.world.messages()
-        observation.set("messages", messages)
-        observation.set("message_mask", heard)
+        observation.set("messages", self.world.messages())
         for name, leaf in leaves.items():
             observation.set(name, leaf)
         out.set("state", self._runner.state())
