@@ -28,6 +28,12 @@ _NEVER = 1 << 62
 Leaves = dict[str, Float32[Tensor, "B *K N F"]]
 
 
+def steps_ahead(scenario: Scenario, batch_size: int, longest: int = _LONGEST) -> int:
+    """How many steps it pays to sense at once."""
+    at_once = _AGENT_STEPS // max(1, batch_size * scenario.arena.n_uavs)
+    return max(1, min(at_once, longest, scenario.horizon + 1))
+
+
 class Step(NamedTuple):
     """What one step of the world brings.
 
@@ -66,8 +72,7 @@ class World:
         self.scenario = scenario
         self.batch_size = batch_size
         self.device = torch.device(device)
-        ahead = _AGENT_STEPS // (batch_size * scenario.arena.n_uavs)
-        self.window = window or max(1, min(ahead, _LONGEST, scenario.horizon + 1))
+        self.window = window or steps_ahead(scenario, batch_size)
         if scenario.commanded:
             self.window = 1
         self._rows = max(1, _AGENT_STEPS // (self.window * scenario.arena.n_uavs))
@@ -92,6 +97,13 @@ class World:
         ignored. Raises ValueError for another number of seeds, and for one that is not a whole
         number from 0 to 2⁶².
         """
+        self.restart(seeds, rows)
+        return self.observation()
+
+    def restart(
+        self, seeds: Int64[Tensor, "B"] | Sequence[int] | int, rows: Bool[Tensor, "B"] | None = None
+    ) -> None:
+        """``reset`` without the observation: for a face, which builds its own."""
         seeds = checked_seeds(seeds, self.batch_size, self.device)
         if rows is None or self.cursor < 0 or bool(rows.all()):
             self.seeds = seeds.clone()
@@ -100,7 +112,6 @@ class World:
             self._sense(torch.zeros_like(seeds), None)
         else:
             self._reset_rows(seeds, rows.nonzero()[:, 0])
-        return self.observation()
 
     def _place(self, seeds: Int64[Tensor, "B"]) -> None:
         """All that is drawn once an episode."""
@@ -136,7 +147,7 @@ class World:
             return
         left = self.sensed.map(lambda x: x[:, self.cursor :])
         fresh = World(self.scenario, len(rows), self.device, left.count)
-        fresh.reset(seeds[rows])
+        fresh.restart(seeds[rows])
 
         def merge(old: Tensor, new: Tensor) -> Tensor:
             return old.index_put((rows,), new)

@@ -70,6 +70,11 @@ class ActionMode(ABC):
         return () if self.choices else (self.width,)
 
     @property
+    def relative(self) -> bool:
+        """Whether actions are relative to a position."""
+        return type(self).reference is not ActionMode.reference
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What describes it, beside the beliefs."""
         return {"name": self.name}
@@ -263,7 +268,7 @@ def chosen_leaves(
 def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:
     """Bounds of the flat state: the truth's, and those of the error that goes with the mode."""
     low, high = state_bounds(scenario)
-    if type(mode).reference is not ActionMode.reference:
+    if mode.relative:
         more = scenario.arena.n_uavs * mode.dim
         low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
     return low, high

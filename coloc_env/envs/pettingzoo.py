@@ -109,7 +109,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.seed = checked_seed(seed, self.scenario.name)
         self._next_seed = self.seed + 1
         self.agents = list(self.possible_agents)
-        self.world.reset([self.seed])
+        self.world.restart([self.seed])
         self._window = _Window(self.world)
         self._tallies = {agent: _Tally(self.seed) for agent in self.agents}
         if self._renderer is not None:
