@@ -14,6 +14,7 @@ from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
 from training.cli.render import render
+from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
@@ -61,6 +62,7 @@ app = typer.Typer(
 )
 for _command in (
     evaluate,
+    report,
     score,
     scenarios,
     agents,

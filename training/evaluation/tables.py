@@ -42,12 +42,18 @@ def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     return lines
 
 
+def heading(results: Evaluation) -> str:
+    """Which worlds the table is about."""
+    runs = "1 run" if results.runs == 1 else f"{results.runs} runs"
+    what = f"{runs} of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    return f"{results.scenario.name}: {what}, seeds {results.seed} to {last}"
+
+
 def markdown(results: Evaluation) -> str:
     """The main table, paired differences to the first agent, and what the words mean."""
     names, dim = list(results.agents), results.scenario.arena.dim
-    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
-    last = results.seed + results.runs - 1
-    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    text = [f"# {heading(results)}", ""]
     if results.scenario.overrides:
         chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
