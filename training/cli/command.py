@@ -18,6 +18,7 @@ from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
+from training.cli.view import view
 
 
 class _Plain(TyperGroup):
@@ -68,6 +69,7 @@ for _command in (
     agents,
     tasks,
     render,
+    view,
     bench,
     train,
     reproduce,

@@ -12,7 +12,7 @@ import pytest
 from coloc_env import make_scenario
 from training.evaluation import runs
 from training.evaluation.evaluate import evaluate
-from training.evaluation.report.content import _axes, command, content, worst
+from training.evaluation.report.content import command, content, half_axes, worst
 from training.evaluation.report.page import page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -81,7 +81,7 @@ def test_ellipsoids_hold_what_they_say() -> None:
     """Of a Gaussian, 95 % lies within."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
-    axes = _axes(root @ root.T)
+    axes = half_axes(root @ root.T)
     points = rng.normal(size=(20000, 3)) @ root.T
     inside = (np.linalg.solve(axes, points.T) ** 2).sum(0) <= 1
     assert inside.mean() == pytest.approx(0.95, abs=0.01)
