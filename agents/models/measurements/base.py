@@ -100,9 +100,11 @@ def noise_std(std: float) -> float:
 
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
-    that marks which of its measurements are there (None: a single one, always)."""
+    that marks which of its measurements are there (None: a single one, always). ``testable`` is
+    false for a belief that enters like a measurement, and says nothing of who predicts well."""
 
     cooperative = False
+    testable = True
     mask_leaf: str | None = None
 
     def count(self, observation: Observation) -> int:
