@@ -39,15 +39,44 @@ def local(seen: Seen) -> Tensor:
     return ((gain >= most) & (gain > 0)).long()
 
 
+def central(seen: Seen) -> Tensor:
+    """Speaker by speaker the one that raises most what all listeners together will gain, as each
+    hears exactly one in reach: for one that sees all."""
+    b, n = seen.plane.shape[:2]
+    gain = seen.memory.more["gains"].view(b, n, n)  # of listener i, by speaker j
+    apart = (seen.position.unsqueeze(2) - seen.position.unsqueeze(1)).norm(dim=-1)
+    near = (apart <= seen.task.radius).to(gain.dtype)
+    speaks = torch.zeros(b, n)
+    worth = torch.zeros(b, 1)
+    for _ in range(n):
+        tried = (speaks.unsqueeze(1) + torch.eye(n)).clamp(max=1.0)  # [B, k, n]: k speaks, too
+        heard = tried @ near  # [B, k, i]: how many i would hear
+        found = (tried @ (gain * near).transpose(1, 2)) * (heard == 1) * (1 - tried)
+        best, choice = found.sum(-1).max(-1, keepdim=True)
+        better = best > worth + 1e-9
+        speaks = torch.where(
+            better, tried.gather(1, choice.unsqueeze(-1).expand(-1, -1, n))[:, 0], speaks
+        )
+        worth = torch.where(better, best, worth)
+    return speaks.long()
+
+
 class Beacon(Task):
     """Ten UAVs on waypoints, two anchors that only the near can range to. Each speaks or listens;
     who hears exactly one ranges to it and fuses its estimate, by covariance intersection.
 
-    Reward of each: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise, m/√m.
+    Reward of each: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise,
+    m/√m.
     A local rule does as well as a planner here: a sanity check more than a challenge.
     """
 
-    policies: ClassVar = {"random": random_policy, "idle": idle, "slots": slots, "local": local}
+    policies: ClassVar = {
+        "random": random_policy,
+        "idle": idle,
+        "slots": slots,
+        "local": local,
+        "central": central,
+    }
     best = "local"
     sampled = True
     about: ClassVar = {
@@ -91,7 +120,9 @@ class Beacon(Task):
         return memory, memory.action
 
     def start(self, blank: Float32[Tensor, "B N"]) -> dict[str, Tensor]:
-        return {"called": blank.clone(), "gain": blank.clone()}
+        n = blank.shape[1]
+        gains = blank.unsqueeze(-1).repeat(1, 1, n)
+        return {"called": blank.clone(), "gain": blank.clone(), "gains": gains}
 
     def keep(self, memory: TaskMemory, observation: Observation) -> TaskMemory:
         """What all who are in reach would gain, in m², if a UAV alone spoke."""
@@ -99,7 +130,8 @@ class Beacon(Task):
         own = own_covariance(memory.joint)
         near = (p.unsqueeze(2) - p.unsqueeze(1)).norm(dim=-1) <= self.radius
         near = near & ~torch.eye(p.shape[1], dtype=torch.bool)
-        memory.more["gain"] = (intersection_gains(p, own) * near).sum(1)
+        gains = intersection_gains(p, own) * near
+        memory.more["gains"], memory.more["gain"] = gains, gains.sum(1)
         return memory
 
     def allowed(self, memory: TaskMemory) -> Bool[Tensor, "B n C"]:

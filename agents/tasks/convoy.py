@@ -66,8 +66,8 @@ def leapfrog(seen: Seen, stride: float = 30.0) -> Tensor:
 class Convoy(Task):
     """Four UAVs in a corridor of 200 × 20 m, with two anchors at its entry.
 
-    Reward of each: new ground in x over v_max, counted where the true error is below 1 m. ``drift``:
-    odometry's noise, m/√m.
+    Reward of each: new ground in x over v_max, counted where the true error is below 1 m.
+    ``drift``: odometry's noise, m/√m.
     """
 
     name = "convoy-v0"

@@ -51,8 +51,7 @@ class Predictor:
         sensor = task.believed.sensor(Displacement)
         assert sensor is not None
         self.odometry, self.eye = sensor, torch.eye(total * task.dim)
-        motion = getattr(task.scenario.motion, "groups", ((task.scenario.motion, n),))[0][0]
-        self.a_max: float = motion.a_max
+        self.a_max = task.a_max
 
     def start(
         self,
@@ -83,7 +82,7 @@ class Predictor:
         self, position: Float[Tensor, "M N d"], p: Float[Tensor, "M D D"]
     ) -> Float[Tensor, "M D D"]:
         """P⁺ = (I + P Λ)⁻¹ P, with all ranges that are in reach, expanded to the second order."""
-        m, total, d = position.shape
+        total, d = position.shape[1:]
         apart = self.ends @ position - self.fixed  # [M, K, d]
         distance = apart.norm(dim=-1).clamp_min(1.0)
         unit = apart / distance.unsqueeze(-1)

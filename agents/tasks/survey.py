@@ -39,8 +39,8 @@ def cell_of(position: Float[Tensor, "*s d"]) -> Tensor:
 def nearest(
     seen: Seen, barred: Bool[Tensor, "B n C"] | None = None, home_at: float = torch.inf
 ) -> Tensor:
-    """Each goes to the nearest open cell that nobody before it has chosen; home if it is less sure
-    of its position than ``home_at`` m."""
+    """Each goes to the nearest open cell that nobody before it has chosen; home if σ, all axes
+    together, is above ``home_at`` m."""
     n = seen.task.n_agents
     own, covered = seen.plane[:, :n], seen.memory.more["covered"][:, 0] > 0
     cost = (own.unsqueeze(2) - _PLACES).norm(dim=-1) + 1e3 * covered.unsqueeze(1)
@@ -56,22 +56,22 @@ def nearest(
             torch.full((1, 1, 1), 2e3).expand(len(cost), n, 1),
         )
     goal = torch.stack(goals, 1)
-    lost = (seen.sigma[:, :n] > home_at).unsqueeze(-1)
+    lost = (total_sigma(seen.memory.joint)[:, :n] > home_at).unsqueeze(-1)
     return towards(seen, torch.where(lost, torch.tensor(_HOME), goal))
 
 
 def home_when_lost(seen: Seen) -> Tensor:
-    """The nearest open cell; home at σ > 1 m."""
-    return nearest(seen, home_at=1.0)
+    """The nearest open cell; home at σ > 1 m, where cells are about to count no more."""
+    return nearest(seen, home_at=_KNOWN)
 
 
 def frontier(seen: Seen) -> Tensor:
-    """The nearest open cell that at least two anchors or other UAVs are near; home at σ > 1.5 m."""
+    """The nearest open cell that at least two anchors or other UAVs are near; home at σ > 1 m."""
     n, task = seen.task.n_agents, seen.task
     apart = (seen.plane[:, :n].unsqueeze(2) - _PLACES).norm(dim=-1) < task.radius
     near = apart.sum(1, keepdim=True) - apart.long()
     near = near + ((task.anchors[:, None, :2] - _PLACES).norm(dim=-1) < task.radius).sum(0)
-    return nearest(seen, near < 2, 1.5)
+    return nearest(seen, near < 2, _KNOWN)
 
 
 class Planner(Cem):

@@ -53,9 +53,10 @@ class Task(ActionMode):
     """Base of all tasks: ``scenario``, ``n_agents`` UAVs that act, and options.
 
     ``policies``: heuristics by name, ``random`` and ``idle`` among them; ``best``: the best one
-    that is known. ``planners``: makers of policies that search, far slower. ``sampled``: policies that learn are to be scored by actions drawn from them, not
-    by the most probable ones. ``shared``: what is rewarded is nobody's own. ``about``: what the
-    task's own parts of the observation are. ``hard``: in space, with walls.
+    that is known. ``planners``: makers of policies that search, far slower. ``sampled``: policies
+    that learn are to be scored by actions drawn from them, not by the most probable ones.
+    ``shared``: what is rewarded is nobody's own. ``about``: what the task's own parts of the
+    observation are. ``hard``: in space, with walls.
     """
 
     rewards = True
@@ -84,7 +85,7 @@ class Task(ActionMode):
         if self.shared and chosen.credit == "own":
             raise ValueError(f"{self.name}: credit='own' is not allowed: rewards are the team's")
         self.estimator: Localizer[Any] = make(chosen.estimator, scenario)
-        self.radius, self.v_max = radius, v_max
+        self.radius, self.v_max, self.a_max = radius, v_max, a_max
         self.control = chosen.control if isinstance(chosen, SteeredTaskOptions) else "velocity"
         self.scale = v_max if self.control == "velocity" else a_max
         self.meaning = type(self).meaning if self.choices else _MEANINGS[self.control]

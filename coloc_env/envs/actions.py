@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from coloc_env.commands import Commands
+from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import Observation, action_bounds, all_leaves, box, state_bounds
 from coloc_env.scenario import Believed, Scenario
+from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Leaf
 from coloc_env.world import Step, World
 
@@ -129,7 +130,9 @@ class ActionMode(ABC):
 class Estimates(ActionMode):
     """The estimate itself, as localizers give it (values beyond ``bounds`` are scored as well).
 
-    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame).
+    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame);
+    where links are decided upon, the call in that step, to the nearest whole number: −1 for none, a
+    UAV's number or N + m for anchor m where they are chosen, 0 to speak where they are broadcast.
     """
 
     name = "estimate"
@@ -137,15 +140,20 @@ class Estimates(ActionMode):
 
     def __init__(self, believed: Believed) -> None:
         super().__init__(believed)
-        self.largest = believed.largest_command
-        if self.largest:
-            self.meaning = "[position, velocity, log-std, command]"
+        self.largest, self.calls = believed.largest_command, believed.links != "all"
+        self.last = 0  # call
+        if believed.links == "chosen":
+            anchors = believed.sensor(AnchorRanging)
+            self.last = believed.arena.n_uavs + (len(anchors.anchors) if anchors else 0) - 1
+        command = ", command" if self.largest else ""
+        self.meaning = f"[position, velocity, log-std{command}{', call' if self.calls else ''}]"
 
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
         low, high = action_bounds(self.believed.arena)
         more = [self.largest] * self.dim if self.largest else []
-        return low + [-x for x in more], high + more
+        calls = [float(self.last)] if self.calls else []
+        return low + [-x for x in more] + [-1.0 for _ in calls], high + more + calls
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
@@ -153,7 +161,9 @@ class Estimates(ActionMode):
         return None, action[..., : 3 * self.dim]
 
     def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
-        return Commands(action[..., 3 * self.dim :] if self.largest else None)
+        d = self.dim
+        calls = action[..., -1].round().clamp(SILENT, self.last).long() if self.calls else None
+        return Commands(action[..., 3 * d : 4 * d] if self.largest else None, calls)
 
 
 class ModeRunner:

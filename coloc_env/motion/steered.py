@@ -87,12 +87,13 @@ class Steered(Motion):
             place = torch.minimum(torch.maximum(free, low), high)
             if self.walls:
                 place = stopped(position, place, self.walls)
+            changed = torch.where(place == free, faster - velocity, 0.0)  # without what walls take
             faster = torch.where(place == free, faster, 0.0)
             x, y = unit(faster[..., 0], faster[..., 1])
             turned = torch.stack((x, y), -1)
             moving = (faster[..., :2] != 0).any(-1, keepdim=True)
             position = torch.where(moves, place, position)
-            change = torch.where(moves, faster - velocity, change)
+            change = torch.where(moves, changed, change)
             velocity = torch.where(moves, faster, velocity)
             ahead = torch.where(moves & moving, turned, ahead)
             path.append((position, velocity, ahead))

@@ -44,7 +44,8 @@ def scores() -> dict[str, list[dict[str, Any]]]:
 
 
 def page() -> str:
-    header = "| policy | return | IQM | error, m | span | interaction | cooperation | bytes | m | worlds |"
+    names = ("policy", "return", "IQM", "error, m", "span", "interaction", "cooperation", "bytes")
+    header = "| " + " | ".join((*names, "distance, m", "worlds")) + " |"
     text = [_HEAD]
     for task, rows in sorted(scores().items()):
         text += [f"## {task}\n", header, "|---|" + 9 * "---:|"]

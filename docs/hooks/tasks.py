@@ -28,7 +28,8 @@ def index() -> str:
         [
             "# Tasks\n",
             "Worlds in which decisions matter, with an estimator in the loop. "
-            "[What they are for](../../results/tasks.md); [who is best](../../results/leaderboard.md).\n",
+            "[What they are for](../../results/tasks.md); "
+            "[who is best](../../results/leaderboard.md).\n",
             table(["task", "what it is"], rows),
         ]
     )

@@ -68,7 +68,7 @@ def score(
     alone = mean("no_uav_ranges", "team")
     span = float(best.mean() - random.mean())
     name = policy if isinstance(policy, str) else getattr(policy, "__name__", "a function")
-    figures = {
+    figures: dict[str, Any] = {
         "task": task_name,
         "policy": name,
         "worlds": worlds,
@@ -94,11 +94,11 @@ def score(
     for figure in ("messages", "bytes", "distance", "energy", "collisions"):
         figures[figure] = float(mean("policy", figure).mean())
     if len(policies) > 1:
-        each = np.array([run["team"].mean() for run in found["policy"]])
+        by_seed = np.array([run["team"].mean() for run in found["policy"]])
         figures["seeds"] = {
-            "returns": each.tolist(),
-            "interquartile_mean": interquartile_mean(each),
-            "interval_95": list(bootstrap(each)),
+            "returns": by_seed.tolist(),
+            "interquartile_mean": interquartile_mean(by_seed),
+            "interval_95": list(bootstrap(by_seed)),
         }
     return {**figures, "returns": own.tolist()}
 

@@ -1,6 +1,7 @@
 """Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -42,12 +43,18 @@ def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     return lines
 
 
+def heading(results: Evaluation) -> str:
+    """Which worlds the table is about."""
+    runs = "1 run" if results.runs == 1 else f"{results.runs} runs"
+    what = f"{runs} of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    return f"{results.scenario.name}: {what}, seeds {results.seed} to {last}"
+
+
 def markdown(results: Evaluation) -> str:
     """The main table, paired differences to the first agent, and what the words mean."""
     names, dim = list(results.agents), results.scenario.arena.dim
-    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
-    last = results.seed + results.runs - 1
-    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    text = [f"# {heading(results)}", ""]
     if results.scenario.overrides:
         chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
@@ -66,6 +73,16 @@ def markdown(results: Evaluation) -> str:
     if results.dropped:
         text += ["", left_out(results)]
     return "\n".join(text) + "\n"
+
+
+def html_table(results: Evaluation) -> str:
+    """The main table as notebooks show it."""
+    lines = [["", *COLUMNS.values()], *rows(results)]
+    cells = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in line)
+        for line, tag in zip(lines, ["th", *["td"] * (len(lines) - 1)], strict=True)
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in cells) + "</table>"
 
 
 def left_out(results: Evaluation) -> str:

@@ -14,7 +14,6 @@ from agents.models.process import Process
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-_FARTHEST = 1e4  # m: of distances that a sensor can measure
 _LEAST_STD = 1e-3  # m, rad
 
 
@@ -94,18 +93,6 @@ class Block:
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
 
 
-def usable(
-    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
-) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
-    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
-    ``ranges``, the first is no distance that a sensor can give. Every measurement model reads its
-    leaves through this."""
-    mask = mask & z.isfinite().all(-1)
-    if ranges:
-        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
-    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
-
-
 def noise_std(std: float) -> float:
     """The noise (m, rad) that a filter may assume: a sensor without any would leave no weights."""
     return max(std, _LEAST_STD)
@@ -113,9 +100,11 @@ def noise_std(std: float) -> float:
 
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
-    that marks which of its measurements are there (None: a single one, always)."""
+    that marks which of its measurements are there (None: a single one, always). ``testable`` is
+    false for a belief that enters like a measurement, and says nothing of who predicts well."""
 
     cooperative = False
+    testable = True
     mask_leaf: str | None = None
 
     def count(self, observation: Observation) -> int:
