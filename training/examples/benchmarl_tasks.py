@@ -1,15 +1,21 @@
 """BenchMARL's own command on the tasks: any of its algorithms and models, by Hydra.
 
-In the environment of ``benchmarl_mappo`` (with ``safetensors`` and ``hydra-core``), from here:
+In an environment of its own, which keeps coloc's torch (``benchmarl_mappo`` says why):
 
-    python -m training.examples.benchmarl_tasks algorithm=mappo task=coloc/survey-v0
+    python3.11 -m venv /tmp/benchmarl && . /tmp/benchmarl/bin/activate
+    pip install torch==2.13.0 "torchrl==0.11.1" numpy tqdm hydra-core "av<14"
+    pip install gymnasium pettingzoo jaxtyping pyyaml matplotlib scipy safetensors
+    pip install --no-deps benchmarl==1.5.2 -e .
+    python -m training.examples.benchmarl_tasks
     python -m training.examples.benchmarl_tasks algorithm=qmix task=coloc/schedule-v0 seed=1
 
-``task.options`` are the task's, as ``coloc score`` takes them (``task.options=n_uavs=6:drift=0.2``);
-everything else is BenchMARL's (``experiment.max_n_frames=2_000_000``). A frame is a step of the
-world; Hydra writes into ``outputs/``.
+The first line is MAPPO on ``survey-v0``. ``task.options`` are the task's, as ``coloc score`` takes
+them, in quotes of their own (``"task.options='n_uavs=6:drift=0.2'"``); everything else is
+BenchMARL's (``experiment.max_n_frames=2_000_000``). A frame is a step of the world; Hydra writes
+into ``outputs/``.
 """
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -106,6 +112,8 @@ def main() -> None:
     from benchmarl.run import hydra_experiment
 
     register()
+    if len(sys.argv) == 1:
+        sys.argv += ["algorithm=mappo", "task=coloc/survey-v0"]
     hydra_experiment()
 
 

@@ -159,6 +159,7 @@ def _ppo(
     clip: Factor = 0.2,
     entropy: Share = 0.003,
     last_entropy: Share = 0.0,
+    draw: bool = False,
     seed: Seed = 0,
     score_worlds: ScoreWorlds = 256,
 ) -> Training:
@@ -176,7 +177,7 @@ def _ppo(
             moves,
             hold,
             relations_width(made, network),
-            sampled=made.sampled,
+            sampled=draw or made.sampled,
         )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
@@ -271,8 +272,10 @@ def task_mappo(**options: Any) -> Training:
     recurrent, graph attention over neighbours, or one that scores each candidate exchange.
     ``moves``: choices in place of velocities; ``hold``: for how many steps each decision is held.
     ``difference``: each call is rewarded by what it was worth to the team; the task's own option
-    ``reward=sigma`` rewards the filter's σ in place of the true error. Learning rate and entropy
-    bonus fall linearly. At the end the policy meets ``score_worlds`` of the protocol's worlds.
+    ``reward=sigma`` rewards the filter's σ in place of the true error. ``draw``: the policy goes on
+    drawing its actions when training is over, as it does anyway where a channel is shared. Learning
+    rate and entropy bonus fall linearly. At the end the policy meets ``score_worlds`` of the
+    protocol's worlds.
     """
     return _ppo("task-mappo", MAPPOLoss, **options)
 
