@@ -244,6 +244,8 @@ def _ppo(
         if collector.epoch == 0:
             critic.fit(rewards, gamma)
         rewards.div_(critic.unit)
+        # The horizon is what ends an episode, and its return: nothing comes after it.
+        batch["next", "terminated"] = batch["next", "done"]
         with torch.no_grad():
             loss.value_estimator(batch)  # advantages, of steps in order: before any shuffling
         kept = batch.select(*_KEPT, strict=False)
