@@ -19,8 +19,9 @@ torch.set_num_threads(1)
 {name: option.default for name, option in TRAININGS.options_of("task-mappo").items()}
 
 # %% [markdown]
-# `reward=sigma` rewards by how likely the filter thinks that a UAV knows its position: smoother than
-# whether it does. Scores are of the true error either way. A training is a folder. This one is a tenth of the real one; on a command line, the real one is
+# `reward=sigma` rewards by how likely the filter thinks that a UAV knows its position, smoother
+# than whether it does; scores are of the true error either way. A training is a folder. This one
+# is a tenth of the real one; on a command line, the real one is
 #
 # ```bash
 # coloc train task-mappo --out runs/survey --set task=survey-v0:reward=sigma
