@@ -4,6 +4,7 @@ A ``Block`` holds m measurements of k numbers each, per UAV, masked; filters of 
 UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
@@ -106,6 +107,11 @@ def usable(
     return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
 
 
+def believed_biases(*std: float) -> tuple[float, ...]:
+    """Standard deviations of the biases of a link's numbers; none where all are 0."""
+    return std if any(std) else ()
+
+
 def noise_std(std: float) -> float:
     """The noise (m, rad) that a filter may assume: a sensor without any would leave no weights."""
     return max(std, _LEAST_STD)
@@ -113,10 +119,15 @@ def noise_std(std: float) -> float:
 
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
-    that marks which of its measurements are there (None: a single one, always)."""
+    that marks which of its measurements are there (None: a single one, always). ``depth``: how many
+    measurements of one link a step can have. ``bias_std`` of each number that a link measures
+    (empty: none is believed to be biased), over ``bias_time`` s."""
 
     cooperative = False
     mask_leaf: str | None = None
+    depth = 1
+    bias_std: tuple[float, ...] = ()
+    bias_time = math.inf
 
     def count(self, observation: Observation) -> int:
         """How many measurements its block has."""
