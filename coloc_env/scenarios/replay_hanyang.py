@@ -2,7 +2,7 @@
 
 from coloc_env.options import Metres, Seconds, WhiteAcceleration
 from coloc_env.scenario import ConstantVelocity, PriorOptions, Reward, Scenario
-from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.scenarios.parts.replays import BiasOptions, ReplayOptions
 from coloc_env.scenarios.parts.tag_replays import anchor_scenario, corrected, ranging_grid
 
 
@@ -13,6 +13,7 @@ def replay_hanyang(
     velocity_accel_std: WhiteAcceleration = 0.5,
     reward: Reward = "error",
     replay: ReplayOptions = ReplayOptions(),
+    biases: BiasOptions = BiasOptions(),
     prior: PriorOptions = PriorOptions(prior_std=1.0, max_speed=1.5),
 ) -> Scenario:
     """A tag on the ground for 3 to 5 min, up to 50 m from four anchors within 5 m of each other
@@ -30,4 +31,5 @@ def replay_hanyang(
     recording = corrected(replay.load("hanyang"), range_delay, 0.0)
     grid = ranging_grid(recording, replay, margin=0.04)
     start, model = prior.at_start(0.1, 0.2), ConstantVelocity(velocity_accel_std)
-    return anchor_scenario("replay-hanyang-v0", recording, grid, start, model, range_std, reward)
+    noise = biases.noise(range_std)
+    return anchor_scenario("replay-hanyang-v0", recording, grid, start, model, noise, reward)

@@ -4,7 +4,7 @@ from typing import Literal
 
 from coloc_env.options import AngularRate, Coordinate, Metres, Speed, WhiteAcceleration
 from coloc_env.scenario import ConstantVelocity, PriorOptions, Process, Reward, Scenario, Wheeled
-from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.scenarios.parts.replays import BiasOptions, ReplayOptions
 from coloc_env.scenarios.parts.tag_replays import anchor_scenario, corrected, ranging_grid
 from coloc_env.sensors import Odometry
 
@@ -19,6 +19,7 @@ def replay_tuc(
     turn_std: AngularRate = 0.2,
     reward: Reward = "error",
     replay: ReplayOptions = ReplayOptions(dt=0.128),
+    biases: BiasOptions = BiasOptions(),
     prior: PriorOptions = PriorOptions(prior_std=0.5, max_speed=0.5),
 ) -> Scenario:
     """A wheeled robot for 30 s in a square of 2.4 m among four anchors (TU Chemnitz "Labyrinth"):
@@ -38,6 +39,5 @@ def replay_tuc(
     if process == "wheeled":
         model, odometry = Wheeled(), Odometry(forward_std, 0.5 * forward_std, turn_std)
     start = prior.at_start(0.1, 0.2)
-    return anchor_scenario(
-        "replay-tuc-v0", recording, grid, start, model, range_std, reward, odometry
-    )
+    noise = biases.noise(range_std)
+    return anchor_scenario("replay-tuc-v0", recording, grid, start, model, noise, reward, odometry)
