@@ -1,8 +1,8 @@
 """What sensors' biases make of the errors of a team whose positions are estimated all at once.
 
-Each UAV for itself, with the gains of its own marginal covariance: those of the ranges to others
-count their ends' variance as noise. The weights that the team's solution gave its links are not
-known here; Huber's at the solution stand for them.
+Each UAV for itself, with the gains that a Kalman filter of its marginal would have: ranges to others
+count their ends' variance as noise, and Huber's weights at the solution stand for those that the
+solution gave its links.
 """
 
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from torch import Tensor
 from agents.models.biases import Biases, Considered
 from agents.models.measurements import Neighbours
 from agents.models.process import Process
+from agents.models.update import information, posterior
 from agents.robust import Trust
 from agents.robust.huber import huber_weights
 from agents.swarm.marginals import regular
@@ -47,9 +48,11 @@ def after_step(
         for m in biases.models
     ]
     trusts = [Trust(huber_weights(block)) for block in blocks]
+    precision, vector = information(blocks, trusts)
+    _, posterior_covariance = posterior(prior, precision, vector)
     considered = biases.predict(considered, f, observation)
     return biases.of_update(
-        considered, prior, regular(after.covariance), blocks, trusts, observation
+        considered, prior, regular(posterior_covariance), blocks, trusts, observation
     )
 
 
