@@ -143,7 +143,7 @@ class JointEkf(Localizer[GaussianBelief]):
         evidence: Any = None
         blocks: list[Block] = []
         trusts: list[Trust] = []
-        broad = prior.broad(self.process.dim).any(-1, keepdim=True)
+        broad = self._broad(prior)
         extra = self.screen.extra if bool(broad.any()) else 0
         for iteration in range(-extra, self.iterations):
             blocks = self._blocks(state, observation)
@@ -163,7 +163,7 @@ class JointEkf(Localizer[GaussianBelief]):
             if iteration < 0:  # extra iterations are for broad priors alone
                 delta = torch.where(broad, delta, 0.0)
                 state = torch.where(broad.unsqueeze(-1), state, x)
-        vague = prior.broad(self.process.dim, self.process.vague).any(-1, keepdim=True)
+        vague = self._broad(prior, self.process.vague)
         if bool(vague.any()) and not self.second_order:
             own, shared = by_kind(self.models)
             model = Estimation(
@@ -194,6 +194,11 @@ class JointEkf(Localizer[GaussianBelief]):
         n = covariance.shape[1]
         width = covariance.shape[-1] + n * self.biases.count(observation)
         return covariance.new_zeros(*covariance.shape[:-1], width)
+
+    def _broad(self, prior: Prediction, *std: float) -> Bool[Tensor, "B 1"]:
+        """Whether anybody's position is hardly known, of those of whom anything is heard."""
+        broad, heard = prior.broad(self.process.dim, *std), _heard(prior.observation)
+        return (broad if heard is None else broad & heard).any(-1, keepdim=True)
 
     def _own(self, p: Float[Tensor, "B M M"]) -> Float[Tensor, "B N E E"]:
         """Each UAV's own block of the joint covariance."""

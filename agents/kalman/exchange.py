@@ -71,6 +71,10 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         x, covariance = self.process.initial(observation["prior"].double())
         n = x.shape[1]
         team = self.joint.reset(observation).unsqueeze(1).expand(len(x), n, n).clone()
+        diagonal = torch.eye(n, dtype=torch.float64, device=x.device)[:, None, :, None]
+        blocks = covariance[:, :, None, :, None, :] * diagonal
+        team.state = x.unsqueeze(2).repeat(1, 1, n, 1)  # until others are heard of: like oneself
+        team.covariance = blocks.flatten(-2)
         packets = torch.zeros(*x.shape[:2], n, self.window, dtype=torch.bool, device=x.device)
         waiting = packets.unsqueeze(2).repeat(1, 1, self.delay + 1, 1, 1)
         step = torch.zeros(x.shape[:2], dtype=torch.int64, device=x.device)
@@ -173,7 +177,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         b, n = belief.lag.shape
         alike = bool(heard.all()) and not bool(belief.gone.any()) and not bool(belief.lag.any())
         owners = 1 if alike else n  # as long as nothing was missing, one stands for all
-        live = belief.team[:, :owners].flatten(0, 1)
+        live = self._started(belief, observation, heard)[:, :owners].flatten(0, 1)
         lag = belief.lag[:, :owners].flatten()
         team, estimate = live, None
         for age in range(int(lag.max()), -1, -1):
@@ -187,6 +191,24 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         each = estimate.unflatten(0, (b, owners)).expand(b, n, n)[:, own, own]
         team, live = (x.unflatten(0, (b, owners)).expand(b, n, n) for x in (team, live))
         return team, live, each
+
+    def _started(
+        self, belief: ExchangeBelief, observation: Observation, heard: Bool[Tensor, "B N N W"]
+    ) -> GaussianBelief:
+        """The belief in the team; where it is from before the first step, with the priors of those
+        whose first packet has arrived."""
+        team = belief.team
+        if bool((team.step > 0).all()):
+            return team
+        start = self.joint.reset(observation)
+        first = (self.window - 1 - belief.lag)[..., None, None].expand(*heard.shape[:3], 1)
+        known = heard.gather(3, first) & (team.step == 0).unsqueeze(-1)
+        return team.replace(
+            state=torch.where(known, start.state.unsqueeze(1), team.state),
+            covariance=torch.where(
+                known.unsqueeze(-1), start.covariance.unsqueeze(1), team.covariance
+            ),
+        )
 
     def _view(
         self,
@@ -214,15 +236,13 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         self, log: Float32[Tensor, "B N W F"], sent: Bool[Tensor, "B N N W"]
     ) -> Float[Tensor, "B N"]:
         """Bytes of the packets sent, and a bit for each packet that the sender has got or not."""
-        leaves, size = self.log.leaves(log), torch.zeros_like(log[..., 0])
-        masks = {name for name in leaves if name.endswith("_mask")}
-        for name in masks:
-            value = next(v for v in (name[:-5], f"{name[:-5]}s") if v in leaves)
-            each = leaves[value].shape[-1] // leaves[name].shape[-1]
-            size = size + (leaves[name] > 0).sum(-1) * (each * _NUMBER + _INDEX)
-            del leaves[value]
-        driven = [x.shape[-1] for name, x in leaves.items() if name not in masks | {"links"}]
-        size = size + _NUMBER * sum(driven)
+        leaves, widths = self.log.leaves(log), self.log.widths
+        size = torch.zeros_like(log[..., 0])
+        for mask, value in self.log.values.items():
+            each = widths[value] // widths[mask] * _NUMBER + _INDEX
+            size = size + each * (leaves[mask] > 0).sum(-1)
+        measured = {*self.log.values, *self.log.values.values(), "links"}
+        size = size + _NUMBER * sum(width for name, width in widths.items() if name not in measured)
         packets = sent.shape[2] * sent.shape[3]
         return (sent * size.unsqueeze(1)).sum((-2, -1)).double() + -(-packets // 8)
 

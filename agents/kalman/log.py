@@ -31,9 +31,21 @@ class SensedLog:
         row = self.row(observation)
         return row.new_zeros(*row.shape[:2], steps, row.shape[-1])
 
+    @cached_property
+    def values(self) -> dict[str, str]:
+        """The leaf of numbers that each mask is of."""
+        masks = [name for name in self.widths if name.endswith("_mask")]
+        stems = {mask: mask.removesuffix("_mask") for mask in masks}
+        return {mask: stem if stem in self.widths else f"{stem}s" for mask, stem in stems.items()}
+
     def row(self, observation: Observation) -> Float32[Tensor, "B N F"]:
-        """A step's leaves."""
-        return torch.cat([observation[name] for name in self.widths], -1)
+        """A step's leaves; 0 behind a mask."""
+        leaves = {name: observation[name] for name in self.widths}
+        for mask, value in self.values.items():
+            there = (leaves[mask] > 0).unsqueeze(-1)
+            parts = leaves[value].unflatten(-1, (there.shape[-2], -1))
+            leaves[value] = torch.where(there, parts, 0.0).flatten(-2)
+        return torch.cat(list(leaves.values()), -1)
 
     def appended(
         self, log: Float32[Tensor, "B N K F"], observation: Observation
