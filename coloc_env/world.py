@@ -276,6 +276,16 @@ class World:
         return self.sensed.alive[:, self.cursor]
 
     @property
+    def links(self) -> Bool[Tensor, "B N N"]:
+        """Whether a message that UAV j sends now would reach UAV i."""
+        heard, senders = self.now.heard > 0, self.now.senders
+        if senders is None:
+            return heard
+        n = heard.shape[1]
+        counts = torch.zeros(len(heard), n, n, dtype=torch.int64, device=self.device)
+        return counts.scatter_add_(2, senders.expand(heard.shape), heard.long()) > 0
+
+    @property
     def step_index(self) -> Int64[Tensor, "B"]:
         """The step each row is at: 0 after its reset."""
         return self.sensed.steps[:, self.cursor]

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.exchange import ExchangingEkf
+from agents.kalman.expanded import expanded_update
 from agents.kalman.filter import Beside, GaussianBelief, GaussianFilter
 from agents.kalman.fusion import Fusion
 from agents.kalman.intersection import Intersection
@@ -28,6 +29,7 @@ from coloc_env.observation import Observation
 from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
+_OTHERS = {"fusion", "second_order"}  # options that the exchange of measurements has not
 FusionName = Literal["naive", "ci", "pairwise", "exchange"]
 
 
@@ -43,7 +45,9 @@ class CooperativeEkf(GaussianFilter):
     ``fusion`` of what involves neighbours: ``naive``, as if their errors were independent; ``ci``,
     covariance intersection, one neighbour after the other; ``pairwise``, UAVs that meet (at most
     ``partners`` a step) update jointly and keep what they then share; ``exchange``, all raw
-    measurements reach everybody, who runs ``ekf_joint`` on them.
+    measurements reach everybody, who runs ``ekf_joint`` on them. ``second_order``, with
+    ``fusion=ci``: all neighbours at once, by their messages alone, and ranges expanded to the
+    second order, as ``ekf_joint`` has them, where priors are broad too.
     """
 
     name = "ekf"
@@ -58,15 +62,16 @@ class CooperativeEkf(GaussianFilter):
         partners: PositiveCount = 1,
         iterations: PositiveCount = 2,
         cooperate: bool = True,
+        second_order: bool = False,
     ) -> None:
         super().__init__(believed)
-        self.iterations = iterations
+        self.iterations, self.second_order = iterations, second_order
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
         own, shared = by_kind(self.models)
         self.kinds = own, shared
         self.fusion: Fusion | None = None
-        if fusion == "ci" and shared:
+        if fusion == "ci" and shared and not second_order:
             self.fusion = Intersection(believed, self.process, pick(self.models, shared))
         elif fusion == "pairwise" and shared:
             models = pick(self.models, shared)
@@ -80,10 +85,13 @@ class CooperativeEkf(GaussianFilter):
 
         Raises ValueError for options that the fusion does not have."""
         fusion = options.get("fusion", "naive")
+        if fusion != "ci" and options.get("second_order"):
+            raise ValueError(f"second_order=true is not allowed with fusion={fusion}: ci")
         if fusion != "pairwise" and "partners" in options:
             raise ValueError(f"partners is not allowed with fusion={fusion}: only with pairwise")
         if fusion == "exchange" and cls is CooperativeEkf:
-            return ExchangingEkf(believed, **{k: v for k, v in options.items() if k != "fusion"})
+            chosen = {name: options[name] for name in options.keys() - _OTHERS}
+            return ExchangingEkf(believed, **chosen)
         if fusion == "pairwise" and believed.message_delay:
             return LateFusion(believed, cls(believed, **options))
         return cls(believed, **options)
@@ -96,7 +104,9 @@ class CooperativeEkf(GaussianFilter):
         return self.screen.memory(observation)
 
     def shared(self, observation: Observation) -> Float[Tensor, "B N H"]:
-        return super().shared(observation) if self.fusion is None else self.fusion.initial(observation)
+        if self.fusion is None:
+            return super().shared(observation)
+        return self.fusion.initial(observation)
 
     def moved(
         self, shared: Float[Tensor, "B N H"], f: Float[Tensor, "B N E E"]
@@ -119,7 +129,10 @@ class CooperativeEkf(GaussianFilter):
         if self.fusion is not None:
             return self._fused(prior, beside, self.fusion)
         neighbours, seen = received(self.believed, prior.observation), prior.observation
-        found = iterated_update(prior, neighbours, self.screen, self.iterations)
+        if self.second_order:
+            found = expanded_update(prior, neighbours, self.screen)
+        else:
+            found = iterated_update(prior, neighbours, self.screen, self.iterations)
         considered = self.biases.of_update(
             beside.considered, prior.covariance, found.covariance, found.blocks, found.trusts, seen
         )
@@ -148,9 +161,7 @@ class CooperativeEkf(GaussianFilter):
             )
             x, p = found.state, found.covariance
         after_own = replace(prior, state=x, covariance=p)
-        taken, others = fusion.fuse(
-            after_own, replace(beside, shared=others), pick(trusts, shared)
-        )
+        taken, others = fusion.fuse(after_own, replace(beside, shared=others), pick(trusts, shared))
         for one in taken:
             x, p = one.state, one.covariance
             if self.biases:

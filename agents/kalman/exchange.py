@@ -6,7 +6,6 @@ belongs, by running the filter again from the last belief to which nothing was m
 and delay every UAV's estimate is that of ``ekf_joint``.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -142,9 +141,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         belief: ExchangeBelief,
         log: Float32[Tensor, "B N W F"],
         observation: Observation,
-    ) -> tuple[
-        Bool[Tensor, "B N N W"], Bool[Tensor, "B N D N W"], Bool[Tensor, "B N D N W"]
-    ]:
+    ) -> tuple[Bool[Tensor, "B N N W"], Bool[Tensor, "B N D N W"], Bool[Tensor, "B N D N W"]]:
         """Packets known after the step's messages, sent in the last steps, and what was known at
         the ends of the last steps, all with windows that end now."""
         known, sent, told = (_older(x) for x in (belief.known, belief.sent, belief.told))

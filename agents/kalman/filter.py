@@ -162,8 +162,6 @@ class GaussianFilter(Localizer[GaussianBelief]):
 
     def update(
         self, prior: Prediction, beside: Beside
-    ) -> tuple[
-        Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside
-    ]:
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside]:
         """Use the observation's measurements: none here."""
         return prior.state, prior.covariance, prior.memory, beside

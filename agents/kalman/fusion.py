@@ -45,9 +45,7 @@ class Taken:
 class Fusion(ABC):
     """A method for the cooperative ``models`` of a team; ``shared`` as in ``GaussianBelief``."""
 
-    def __init__(
-        self, believed: Believed, process: Process, models: Sequence[Measurement]
-    ) -> None:
+    def __init__(self, believed: Believed, process: Process, models: Sequence[Measurement]) -> None:
         self.believed, self.process, self.models = believed, process, models
 
     @abstractmethod

@@ -19,7 +19,10 @@ from agents.models.measurements import Neighbours, received
 from agents.robust import Prediction, Trust
 from coloc_env.observation import Observation
 
-_OMEGAS = (0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)  # tried, beside 1: no update
+_OMEGAS = (  # tried, beside 1: no update
+    *(0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85),
+    *(0.8, 0.75, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2),
+)
 
 
 class Intersection(Fusion):
@@ -100,7 +103,8 @@ class Intersection(Fusion):
         own = rows.own @ p
         s = own @ rows.own.mT / omega + rows.partner @ theirs @ rows.partner.mT / (1 - omega)
         root = torch.linalg.cholesky_ex(s + torch.diag_embed(rows.variance)).L
-        half = torch.linalg.solve_triangular(root, own[..., :d].expand(len(_OMEGAS), -1, -1, -1, -1), upper=False)
+        ahead_of = own[..., :d].expand(len(_OMEGAS), -1, -1, -1, -1)
+        half = torch.linalg.solve_triangular(root, ahead_of, upper=False)
         total = p[..., :d, :d].diagonal(dim1=-2, dim2=-1).sum(-1)
         ahead = total / omega[..., 0, 0] - half.square().sum((-2, -1)) / omega[..., 0, 0] ** 2
         least, at = ahead.min(0)

@@ -52,8 +52,9 @@ class LateFusion(Localizer[LateBelief]):
         log = self.log.appended(belief.sensed, observation)
         past, now, estimate = belief.past, belief.past, None
         for age in range(self.delay, -1, -1):
-            links = observation["links"] if age == self.delay else torch.zeros_like(observation["links"])
-            leaves = {**observation.leaves, **self.log.leaves(log[..., -1 - age, :]), "links": links}
+            links = observation["links"] * (age == self.delay)
+            sensed = self.log.leaves(log[..., -1 - age, :])
+            leaves = {**observation.leaves, **sensed, "links": links}
             then, estimate = self.core.step(now, Observation(leaves))
             now = chosen(belief.step >= age, then, now)  # no step before the first
             past = now if age == self.delay else past

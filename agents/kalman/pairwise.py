@@ -183,7 +183,10 @@ class Pairwise(Fusion):
         return Taken(state, own, kept, gains), after[..., :e, e:]
 
     def _by_link(
-        self, blocks: Sequence[Block], gain: Float[Tensor, "B N E 2r"], partner: Int64[Tensor, "B N"]
+        self,
+        blocks: Sequence[Block],
+        gain: Float[Tensor, "B N E 2r"],
+        partner: Int64[Tensor, "B N"],
     ) -> dict[Measurement, Float[Tensor, "B N E m k"]]:
         """Gains of what a UAV measured of its partner; with those of the other end where that is
         the same number. (What else the partner measured has biases of the partner's own.)"""

@@ -91,7 +91,8 @@ class Biases:
             block.jacobian.mul(trust.information(block).unsqueeze(-1)).movedim(-1, -3)
             for block, trust in zip(blocks, trusts, strict=True)
         ]
-        gain = after @ self.by_bias(dict(zip(models or self.models, scaled, strict=True)), observation)
+        vectors = dict(zip(models or self.models, scaled, strict=True))
+        gain = after @ self.by_bias(vectors, observation)
         return self.update(considered, kept_share(before, after), gain, observation)
 
     def by_bias(

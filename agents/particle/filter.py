@@ -264,9 +264,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def biases(self) -> Biases:
         return Biases(self.models, self.process.dt)
 
-    def _considered(
-        self, now: Step, density: ImportanceDensity | None
-    ) -> Float[Tensor, "B N E G"]:
+    def _considered(self, now: Step, density: ImportanceDensity | None) -> Float[Tensor, "B N E G"]:
         """What biases make of the error in this step, with the gains of the Gaussian update."""
         belief, seen = now.belief, now.observation
         if density is None or not self.biases:

@@ -1,8 +1,8 @@
 """What sensors' biases make of the errors of a team whose positions are estimated all at once.
 
-Each UAV for itself, with the gains that a Kalman filter of its marginal would have: ranges to others
-count their ends' variance as noise, and Huber's weights at the solution stand for those that the
-solution gave its links.
+Each UAV for itself, with the gains that a Kalman filter of its marginal would have: ranges to
+others count their ends' variance as noise, and Huber's weights at the solution stand for those that
+the solution gave its links.
 """
 
 from dataclasses import dataclass

@@ -43,9 +43,9 @@ class LinkBiases:
         for sensor in scenario.sensors:
             if isinstance(sensor, LandmarkBearings | UavBearings) and any(sensor.bias_std):
                 raise NotImplementedError("bounds: biases of sightings are not counted")
-            if isinstance(sensor, AnchorRanging | Height | Ranging) and _settings(sensor)[0]:
-                if cooperative or not sensor.between_uavs:
-                    found.append(sensor)
+            counted = isinstance(sensor, AnchorRanging | Height | Ranging) and _settings(sensor)[0]
+            if counted and (cooperative or not sensor.between_uavs):
+                found.append(sensor)
         n = scenario.arena.n_uavs if cooperative else 1
         return cls(tuple(found), n, scenario.arena.dt)
 
@@ -150,7 +150,7 @@ def updated(
 def _of_pairs(
     sensor: Ranging, truth: Kinematics, seen: Observation, pose: Float64[Tensor, "D E"]
 ) -> BiasInformation:
-    """Of the biases of pairs of tags p < q: w u J_p at the one's UAV and −w u J_q at the other's."""
+    """Of the biases of pairs of tags p < q: w u J_p at one's UAV and −w u J_q at the other's."""
     links, along, jacobian = range_links(sensor, truth, seen)
     p, q = torch.triu_indices(links.shape[1], links.shape[1], 1, device=links.device)
     weights = links[:, p, q]  # [B, L]

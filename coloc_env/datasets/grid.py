@@ -2,8 +2,8 @@
 
 Step k is at ``start + k dt``. Nothing measured is interpolated or invented: a step delivers what
 arrived in (t_{k−1}, t_k]; what drives a motion model (IMU, odometry) is integrated over that
-interval exactly, each sample held until the next. An IMU's sample is held for 0.1 s at most: beyond
-that its mean stands for it, and how wrong that may be is given with it.
+interval exactly, each sample held until the next, but no longer than it may stand for (an IMU's for
+0.1 s): beyond that the stream's mean does, and how wrong that may be is given with it.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ _TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this clo
 _TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
 _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
-_HELD = 100_000_000  # ns, for which a sample of an IMU stands
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
@@ -99,29 +98,27 @@ def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
     return samples, durations
 
 
-def bridged(table: Table) -> tuple[Table, Table, Floats]:
-    """An IMU's samples, and their mean from 0.1 s after the last sample before a hole on; 1 where
-    the mean stands and 0 elsewhere, in the same form; and the deviation of samples from the mean,
-    root mean square an axis: gyro (rad/s), accelerometer (m/s²)."""
-    mean = table.values.mean(0)
-    spread = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))
-    ends = np.flatnonzero(np.diff(table.time) > _HELD)
-    time = np.insert(table.time, ends + 1, table.time[ends] + _HELD)
+def bridged(table: Table, held: float) -> tuple[Table, Table]:
+    """Samples that stand for ``held`` s at most, and their mean from then on until the next; and 1
+    where the mean stands and 0 elsewhere, in the same form."""
+    mean, most = table.values.mean(0), round(held * 1e9)
+    ends = np.flatnonzero(np.diff(table.time) > most)
+    time = np.insert(table.time, ends + 1, table.time[ends] + most)
     values = np.insert(table.values, ends + 1, mean, 0)
     missing = np.insert(np.zeros((len(table.time), 1)), ends + 1, 1.0, 0)
-    return Table(time, values, table.columns), Table(time, missing, ("missing",)), spread
+    return Table(time, values, table.columns), Table(time, missing, ("missing",))
 
 
 def unknown_on(grid: Grid, missing: Table, spread: Floats) -> Floats:
-    """``imu_unknown`` leaf [T, 2]: standard deviations an axis of what the ``imu`` leaf is off for
-    want of samples: accelerometer (m/s²), gyro (rad/s).
+    """Standard deviations [T, F] of what the mean over each step is off for want of samples, which
+    deviate from their mean by ``spread`` [F].
 
-    What was not measured is taken to be off by ``spread`` (gyro, accelerometer) for about a second
-    at a time: white noise that adds up to the same over a hole is √(2 · 1 s / dt) times that.
+    What was not measured is taken to be off by so much for about a second at a time: white noise
+    that adds up to the same over a hole is √(2 · 1 s / dt) times that.
     """
     samples, durations = held_intervals(grid, missing)
     share = (samples[..., 0] * durations).sum(1) / grid.dt
-    return share[:, None] * spread[::-1] * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
+    return share[:, None] * spread * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
 
 
 def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:

@@ -27,10 +27,13 @@ from coloc_env.sensors import (
     Odometry,
     Ranging,
     RecordedImu,
+    RecordedOdometry,
     RecordedSensor,
     UavBearings,
 )
 from coloc_env.series import Series
+
+_IMU_HELD = 0.1  # s, for which a sample of an IMU stands
 
 
 def recorded_motion(recording: Recording, grid: Grid) -> RecordedMotion:
@@ -63,11 +66,12 @@ def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) ->
     samples are missing leaf ``imu_unknown``."""
     robots, unknown = [], []
     for table, own in zip(recording.streams["imu"], bias, strict=True):
-        whole, missing, spread = bridged(table)
+        whole, missing = bridged(table, _IMU_HELD)
+        gyro, accel = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))  # an axis
         leaf = imu_on(grid, whole, own[:3])
         leaf[:, :3] -= own[3:]
         robots.append(leaf)
-        unknown.append(unknown_on(grid, missing, spread))
+        unknown.append(unknown_on(grid, missing, np.array((accel, gyro))))
     series = {"imu": _series(robots)}
     if np.any(unknown):
         series["imu_unknown"] = _series(unknown)
@@ -78,7 +82,9 @@ def recorded_imu_samples(
     recording: Recording, grid: Grid, sensor: Imu, bias: Floats
 ) -> RecordedImu:
     """``recorded_imu``, and beside the mean over each step its samples, less their bias."""
-    held = [held_intervals(grid, bridged(table)[0]) for table in recording.streams["imu"]]
+    held = [
+        held_intervals(grid, bridged(table, _IMU_HELD)[0]) for table in recording.streams["imu"]
+    ]
     width = max(durations.shape[1] for _, durations in held)
     samples, durations = [], []
     for (values, lasting), own in zip(held, bias, strict=True):
@@ -93,14 +99,26 @@ def recorded_imu_samples(
 
 
 def recorded_odometry(
-    recording: Recording, grid: Grid, sensor: Odometry, delay: float, scale: float
-) -> RecordedSensor:
-    """Leaf ``odometry``: commands taken to act ``delay`` s later, ``scale`` times as strongly."""
-    robots = []
+    recording: Recording,
+    grid: Grid,
+    sensor: Odometry,
+    held: float,
+    delay: float = 0.0,
+    scale: float = 1.0,
+) -> RecordedOdometry:
+    """Leaf ``odometry``: samples that stand for ``held`` s at most, taken to act ``delay`` s later,
+    ``scale`` times as strongly; and where samples are missing leaf ``odometry_unknown``."""
+    robots, unknown = [], []
     for table in recording.streams["odometry"]:
         acting = Table(table.time + round(delay * 1e9), scale * table.values, table.columns)
-        robots.append(odometry_on(grid, acting))
-    return RecordedSensor(sensor, {"odometry": _series(robots)})
+        whole, missing = bridged(acting, held)
+        speed, turn = acting.values.std(0)
+        robots.append(odometry_on(grid, whole))
+        unknown.append(unknown_on(grid, missing, np.array((speed, 0.0, turn))))
+    series = {"odometry": _series(robots)}
+    if np.any(unknown):
+        series["odometry_unknown"] = _series(unknown)
+    return RecordedOdometry(sensor, series)
 
 
 def recorded_bearings(

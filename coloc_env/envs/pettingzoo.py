@@ -19,7 +19,6 @@ from coloc_env.envs.actions import (
     checked_arrays,
     make_mode,
     observed_leaves,
-    privileged_bounds,
 )
 from coloc_env.observation import all_leaves, box, flat_box, observation_space
 from coloc_env.render import Renderer
@@ -75,12 +74,12 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._runner = ModeRunner(self.mode, self.world)
         seen = observed_leaves(scenario, self.mode)
         space: gym.spaces.Space[Any] = observation_space(seen)
-        if self.mode.whole:
+        if self.mode.whole and self.mode.flat:
             space = flat_box({"observation": seen["observation"]})
         actions = action_space(self.mode)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
-        self.state_space = box(privileged_bounds(scenario, self.mode))
+        self.state_space = box(self.mode.state_bounds(scenario))
         self._next_seed: int | None = None
         self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
@@ -215,8 +214,11 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         world = self.world
         if world.sensed is not self._window.sensed:
             self._window = _Window(world)
-        if self.mode.whole:
+        if self.mode.whole and self.mode.flat:
             return self._of(list(leaves["observation"].numpy()[0]))
+        if self.mode.whole:
+            parts = zip(*(leaf.numpy()[0] for leaf in leaves.values()), strict=True)
+            return self._of([dict(zip(leaves, each, strict=True)) for each in parts])
         messages, heard = world.messages()
         now = [leaf[world.cursor] for leaf in self._window.leaves]
         static = [leaf[world.cursor] for leaf in self._window.static]
@@ -269,9 +271,12 @@ class _Tally:
 class _Cycle(parallel_to_aec_wrapper):
     """PettingZoo's agent-environment cycle, each observation of which is a copy."""
 
-    def observe(self, agent: str) -> dict[str, np.ndarray]:
+    def observe(self, agent: str) -> Any:
         """What the agent observes until all have acted."""
-        return {name: leaf.copy() for name, leaf in super().observe(agent).items()}
+        seen = super().observe(agent)
+        if isinstance(seen, dict):
+            return {name: leaf.copy() for name, leaf in seen.items()}
+        return seen.copy()
 
 
 def parallel_env(

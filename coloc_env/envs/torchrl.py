@@ -17,7 +17,6 @@ from coloc_env.envs.actions import (
     chosen_leaves,
     make_mode,
     observed_leaves,
-    privileged_bounds,
 )
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
@@ -33,7 +32,7 @@ class CoLocEnv(EnvBase):
     ``("uav", "reward")`` [B, N, 1], ``("uav", "mask")`` [B, N] (UAVs that have not failed),
     ``state`` [B, S] (privileged truth, and the error of what actions are relative to) and root
     ``done``, ``terminated``, ``truncated`` [B, 1]: an episode ends at its horizon, by truncation;
-    a world in which every UAV failed terminates.
+    a world in which every UAV failed terminates. ``group_map`` names the one group.
 
     Row b of the first episode is the world of seed ``seed + b``, of the next one
     ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's. Without ``seed``
@@ -57,6 +56,7 @@ class CoLocEnv(EnvBase):
         self.scenario = scenario
         self.world = World(scenario, num_envs, device)
         self.mode = make_mode(scenario, action)
+        self.group_map = {"uav": scenario.agents[: self.mode.n_agents]}
         self._runner = ModeRunner(self.mode, self.world)
         self._sensed: Sensed | None = None
         self._set_seed(random_seed() if seed is None else seed)
@@ -71,10 +71,11 @@ class CoLocEnv(EnvBase):
             for name, leaf in observed_leaves(self.scenario, self.mode).items()
         }
         masked = specs.pop("action_mask", None) if self.mode.whole else None
-        leaves = specs["observation"] if self.mode.whole else Composite(specs, shape=(b, n))
+        flat = self.mode.whole and self.mode.flat
+        leaves = specs["observation"] if flat else Composite(specs, shape=(b, n))
         low, high = (
             torch.tensor(x, dtype=torch.float32, device=device)
-            for x in privileged_bounds(self.scenario, self.mode)
+            for x in self.mode.state_bounds(self.scenario)
         )
         self.observation_spec = Composite(
             uav=Composite(
@@ -113,6 +114,11 @@ class CoLocEnv(EnvBase):
         b = self.batch_size[0]
         return CoLocEnv(self.scenario, b, self.device, self.first_seed, action)
 
+    @property
+    def memory(self) -> Any:
+        """The action mode's memory at the step last observed."""
+        return self._runner.memory
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.first_seed = checked_seed(seed, self.scenario.name)
@@ -143,7 +149,12 @@ class CoLocEnv(EnvBase):
             self._frames = self._window(self._sensed).unbind(1)
         out = self._frames[self.world.cursor]
         if self.mode.whole:
-            out["uav"].set("observation", leaves["observation"])
+            if self.mode.flat:
+                out["uav"].set("observation", leaves["observation"])
+            else:
+                parts = {name: leaf for name, leaf in leaves.items() if name != "action_mask"}
+                each = TensorDict(parts, out["uav"].shape, device=self.device)
+                out["uav"].set("observation", each)
             if "action_mask" in leaves:
                 out["uav"].set("action_mask", leaves["action_mask"] > 0)
             out.set("state", self._runner.state())
@@ -246,7 +257,7 @@ class PerUavEnv(EnvBase):
         """A step's entries, a row per UAV."""
         seen = entries["uav", "observation"]
         observation = seen
-        if not self.mode.whole:
+        if not (self.mode.whole and self.mode.flat):
             observation = torch.cat([seen[name] for name in self.leaves], -1)
         flags = ("done", "terminated", "truncated")
         return TensorDict(

@@ -74,9 +74,7 @@ def replay_miluv(
     sensors = [recorded_anchor_ranges(recording, grid, anchors)]
     believed: list[Sensor] = [anchors]
     if "height" in recording.streams:
-        height = Height(
-            height_std, bias_std=height_bias_std, bias_time=biases.range_bias_time
-        )
+        height = Height(height_std, bias_std=height_bias_std, bias_time=biases.range_bias_time)
         sensors.append(recorded_height(recording, grid, height))
         believed.append(height)
     if "uav_ranges" in recording.streams:

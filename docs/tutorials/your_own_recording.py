@@ -19,7 +19,7 @@ except ValueError as error:
 print(f"{len(found)} sequence(s) of MRCLAM here")
 
 # %% [markdown]
-# A recording is a scenario: the same world, faces and localizers. `span` cuts it, in seconds.
+# A recording is a scenario: the same world, interfaces and localizers. `span` cuts it, in seconds.
 
 # %%
 from coloc_env import make_scenario

@@ -14,9 +14,11 @@ from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
 from training.cli.render import render
+from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
+from training.cli.view import view
 
 
 class _Plain(TyperGroup):
@@ -61,11 +63,13 @@ app = typer.Typer(
 )
 for _command in (
     evaluate,
+    report,
     score,
     scenarios,
     agents,
     tasks,
     render,
+    view,
     bench,
     train,
     reproduce,

@@ -78,8 +78,8 @@ def split_agents(text: str) -> list[str]:
     option before (``apf:bounds=100,800``), and so does a piece of a path (``weights=a,b/c``)."""
     names: list[str] = []
     for piece in text.split(","):
-        head = piece.partition("=")[0]
-        path = "/" in head or ".safetensors" in head
+        head, name = piece.partition("=")[0], piece.partition(":")[0]
+        path = "/" in head or ".safetensors" in head or "=" in name
         if names and (path or piece[:1] in set("0123456789+-.")):
             names[-1] += f",{piece}"
         elif piece.strip():

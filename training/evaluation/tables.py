@@ -27,8 +27,8 @@ _EXPLAINED = """\
 Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs, ± its
 standard deviation over runs; max is the mean over runs and UAVs of the largest error. A run counts
 as diverged if a UAV's error stays above {:g} m over its last {:g} s, or if an estimate was not
-finite; it stays in every figure. NEES: {} is consistent, more is overconfident. bytes/step: what each
-UAV sends to others in a step. ms/step: the whole team, one world, one thread."""
+finite; it stays in every figure. NEES: {} is consistent, more is overconfident. bytes/step: what
+each UAV sends to others in a step. ms/step: the whole team, one world, one thread."""
 
 
 def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
@@ -43,12 +43,18 @@ def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     return lines
 
 
+def heading(results: Evaluation) -> str:
+    """Which worlds the table is about."""
+    runs = "1 run" if results.runs == 1 else f"{results.runs} runs"
+    what = f"{runs} of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    return f"{results.scenario.name}: {what}, seeds {results.seed} to {last}"
+
+
 def markdown(results: Evaluation) -> str:
     """The main table, paired differences to the first agent, and what the words mean."""
     names, dim = list(results.agents), results.scenario.arena.dim
-    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
-    last = results.seed + results.runs - 1
-    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    text = [f"# {heading(results)}", ""]
     if results.scenario.overrides:
         chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]

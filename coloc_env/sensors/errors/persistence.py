@@ -73,9 +73,9 @@ def gauss_markov(
     """Standard normal numbers of numbered links, in ``count`` steps from each row's ``first`` on:
     the stationary Gauss–Markov process x ← φ x + √(1 − φ²) e with φ = exp(−1/``time``).
 
-    A pure function of row, step (step 0 before it) and link: the process at every 64th step, which is one of its kind
-    itself, and between two such knots a path from the first that is bent to meet the second
-    (conditional simulation, Chilès & Delfiner, Geostatistics, 2012, section 7.3):
+    A pure function of row, step (step 0 before it) and link: the process at every 64th step, which
+    is one of its kind itself, and between two such knots a path from the first that is bent to meet
+    the second (conditional simulation, Chilès & Delfiner, Geostatistics, 2012, section 7.3):
     b_k = x_k + r_k (c′ − x_C), r_k = Cov(x_k, x_C) / Var(x_C) = φ^(C−k) (1 − φ^2k) / (1 − φ^2C).
     """
     numbers, phi, size = links.flatten(), math.exp(-1 / time), _KNOTS
@@ -96,10 +96,10 @@ def gauss_markov(
     for drawn in white.unbind(-1):
         path.append(phi * path[-1] + math.sqrt(1 - phi**2) * drawn)
     short = right - path[-1]
-    bent = [  # b_k = x_k + r_k (c′ − x_C)
-        x + phi ** (size - k) * math.expm1(-2 * k / time) / math.expm1(-2 * size / time) * short
-        for k, x in enumerate(path[:-1])
-    ]
+    back = math.expm1(-2 * size / time)
+    share = [phi ** (size - k) * math.expm1(-2 * k / time) / back for k in range(size)]  # r_k
+    short = right - path[-1]
+    bent = [x + r * short for x, r in zip(path[:-1], share, strict=True)]
     whole = torch.stack(bent, 2).flatten(1, 2)  # [R, blocks · 64, L]
     steps = first.unsqueeze(-1) + torch.arange(count, device=rows.device)
     at = steps.clamp_min(0) - size * start.unsqueeze(-1)

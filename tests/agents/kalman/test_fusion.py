@@ -1,4 +1,4 @@
-"""Fusion of what UAVs have in common: equal to the joint filter where it can be, and never fooled."""
+"""Fusion of what UAVs have in common: the joint filter where it can be, and never fooled."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -10,12 +10,12 @@ from torch import Tensor
 from agents import make
 from agents.kalman.ekf import CooperativeEkf
 from agents.kalman.pairwise import Pairwise, _offers
-from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 
 
 def pairwise(localizer: Any) -> Pairwise:
-    assert isinstance(localizer, CooperativeEkf) and isinstance(localizer.fusion, Pairwise)
+    assert isinstance(localizer, CooperativeEkf)
+    assert isinstance(localizer.fusion, Pairwise)
     return localizer.fusion
 
 
@@ -71,7 +71,9 @@ def test_a_uav_that_is_never_heard_is_left_out(tools: SimpleNamespace) -> None:
         seen.append(tools.change(o, links=links, range_mask=mask))
     joint = tools.replay(make("ekf_joint", scenario), seen)
     apart = tools.replay(make("ekf:fusion=exchange", scenario), seen)
-    assert apart.beliefs[-1].gone[:, :5, 5].all() and not apart.beliefs[-1].gone[..., :5].any()
+    gone = apart.beliefs[-1].gone[:, :5]
+    assert gone[..., 5].all()
+    assert not gone[..., :5].any()
     found, expected = (r.position[-1][:, :5] for r in (apart, joint))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
@@ -240,5 +242,3 @@ def test_nothing_between_uavs_leaves_nothing_to_fuse(tools: SimpleNamespace) -> 
     for fusion in ("ci", "pairwise", "exchange"):
         other = tools.replay(make(f"ekf:fusion={fusion}", scenario), run.observations)
         torch.testing.assert_close(other.position, run.position, rtol=0, atol=1e-9)
-
-
