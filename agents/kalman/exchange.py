@@ -147,15 +147,15 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         known, sent, told = (_older(x) for x in (belief.known, belief.sent, belief.told))
         n, links = known.shape[1], observation["links"] > 0
         eye = torch.eye(n, dtype=torch.bool, device=known.device)
-        sane = log[..., -1, :].isfinite().all(-1)
+        sane = log.isfinite().all(-1).unsqueeze(1)  # others are spared what is no number
         fresh = torch.zeros_like(known)
-        fresh[..., -1] = eye & sane.unsqueeze(-1)
+        fresh[..., -1] = eye
         # What those that are heard had not got when they sent what is heard now; whether they have
         # got the newest packets, nobody can know yet.
         lacked = (links[..., None, None] & ~told[:, :, 0].unsqueeze(1)).any(2)
         lacked[..., known.shape[-1] - 1 - 2 * self.delay :] = False
         relayed = known & lacked
-        sent = torch.cat((sent[:, :, 1:], (fresh | relayed).unsqueeze(2)), 2)
+        sent = torch.cat((sent[:, :, 1:], ((fresh | relayed) & sane).unsqueeze(2)), 2)
         arrived = (links[..., None, None] & sent[:, :, 0].unsqueeze(1)).any(2)
         known = known | arrived
         known[..., -1] |= eye  # one's own, whatever it holds

@@ -56,6 +56,9 @@ class Intersection(Fusion):
         x, p, d, seen = prior.state, prior.covariance, self.process.dim, prior.observation
         heard = self.neighbours(prior)
         theirs = self._covariances(heard, beside.shared, seen)  # M
+        sound = theirs.isfinite().all(-1).all(-1)
+        theirs = torch.where(sound[..., None, None], theirs, 0.0)
+        heard = replace(heard, known=heard.known & sound)
         around = replace(heard, variance=torch.zeros_like(heard.variance))
         taken = []
         for slot in range(self.believed.slots):

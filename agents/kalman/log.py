@@ -21,7 +21,8 @@ class SensedLog:
     @cached_property
     def widths(self) -> dict[str, int]:
         """Leaves and how many numbers each has."""
-        layout, found = Layout(self.believed.arena, self.believed.slots), {}
+        layout = Layout(self.believed.arena, self.believed.slots)
+        found: dict[str, int] = {}
         for sensor in self.believed.sensors:
             found |= {name: leaf.width for name, leaf in sensor.leaves(layout).items()}
         return found | {"links": self.believed.slots}

@@ -43,8 +43,9 @@ class LinkBiases:
         for sensor in scenario.sensors:
             if isinstance(sensor, LandmarkBearings | UavBearings) and any(sensor.bias_std):
                 raise NotImplementedError("bounds: biases of sightings are not counted")
-            counted = isinstance(sensor, AnchorRanging | Height | Ranging) and _settings(sensor)[0]
-            if counted and (cooperative or not sensor.between_uavs):
+            if sensor.between_uavs and not cooperative:
+                continue
+            if isinstance(sensor, AnchorRanging | Height | Ranging) and _settings(sensor)[0]:
                 found.append(sensor)
         n = scenario.arena.n_uavs if cooperative else 1
         return cls(tuple(found), n, scenario.arena.dt)

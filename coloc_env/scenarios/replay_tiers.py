@@ -49,6 +49,7 @@ def replay_tiers(
     ``calibrated``: each pair's ranges are made shorter by their median error in the recording's
     first ``calibration`` s, by OptiTrack, whatever ``span`` is replayed; not ``calibrated``, they
     are 0.19 to 0.49 m too long. ``held``: ranges that repeat the one before are delivered too.
+    Biases are believed to be those of ``replay-hanyang-v0``.
     Calibration and ``range_std`` were chosen on the first 60 s: ``span=60:208`` is what nothing was
     fitted on.
     """

@@ -28,7 +28,8 @@ def replay_tuc(
     ``process="constant_velocity"`` leaves the odometry out: velocity driven by
     ``velocity_accel_std``. ``range_bias`` (m) is taken off every range. It and the noise settings
     were chosen on the first 15 s. On the rest the EKF is off by 0.099 m RMS (Huber 0.090), without
-    odometry by 0.150 (0.144), without taking the bias off by 0.189 and 0.241. Stamps drift against
+    odometry by 0.150 (0.144), without taking the bias off by 0.189 and 0.241. Biases that last are
+    believed to be those of ``replay-hanyang-v0``. Stamps drift against
     the steps: from 23 s on a range is delivered 0.08 s, from 25 s on 0.05 s after it was measured,
     and a few of the last steps have no truth near enough to be scored.
     """

@@ -142,7 +142,7 @@ CASES = [
     *((f"ekf:fusion={f}", "tags") for f in ("ci", "pairwise", "exchange")),
     *((f"ekf:fusion={f}", "late") for f in ("ci", "pairwise", "exchange")),
     *((n, "wsn") for n in ("pf", "ekf")),
-    *((n, "biased") for n in ("ekf", "ekf_joint", "pf", "map", "ekf:fusion=pairwise")),
+    *((n, "biased") for n in ("ekf", "ekf_joint", "ekf:fusion=pairwise")),
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
