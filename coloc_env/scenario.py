@@ -174,7 +174,9 @@ class Scenario:
     ``anchor_uavs``: the first so many UAVs know where they are and are not scored. ``reference``:
     what is to be reported beside the truth as if it were the truth (None: nothing). ``targets``:
     the last so many UAVs are passive: others range to them, they range neither anchors nor each
-    other. ``strangers``: the first so many UAVs do not range each other.
+    other. ``strangers``: the first so many UAVs do not range each other. ``tuned_on``: sequences of
+    recordings on which constants of the scenario were chosen, so that no score on them is one on
+    data unseen.
     """
 
     name: str
@@ -194,6 +196,7 @@ class Scenario:
     reference: SatelliteReference | None = None
     targets: int = 0
     strangers: int = 0
+    tuned_on: tuple[str, ...] = ()
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -5,7 +5,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from agents.tasks.gains import log_gain
-from agents.tasks.task import Task, TaskMemory, own_sigma
+from agents.tasks.memory import TaskMemory, own_sigma
+from agents.tasks.task import Task
 
 WIDTH = 14
 _NEAR = 1.5  # times the reach: who may disturb each other
@@ -17,8 +18,8 @@ def candidates(task: Task, memory: TaskMemory) -> Float32[Tensor, "B n C K"]:
     Own and the team's predicted gain; whether the gain is the UAV's own best; how its best compares
     to those of all who may disturb it, and whether it is the largest there (ties: the lower number
     has it); the same of the team's gain, beside those of whose exchanges would spoil this one or be
-    spoiled by it; how many UAVs are near the caller and near the one called; distance; σ of both; whether
-    it is a call at all.
+    spoiled by it; how many UAVs are near the caller and near the one called; distance; σ of both;
+    whether it is a call at all.
     """
     n, more = task.n_agents, memory.more
     gain, team = more["gain"], more["team_gain"]  # [B, n, C − 1]

@@ -1,4 +1,4 @@
-"""Decisions of a learned policy in a task: what it reads, and the actions that choices stand for."""
+"""Decisions of a learned policy in a task: what it reads, and what its choices stand for."""
 
 import torch
 from jaxtyping import Float32
@@ -6,7 +6,8 @@ from torch import Tensor
 
 from agents.policies import candidates
 from agents.policies.moves import table
-from agents.tasks.task import Task, TaskMemory
+from agents.tasks.memory import TaskMemory
+from agents.tasks.task import Task
 
 
 def relations(task: Task, memory: TaskMemory, network: str) -> Float32[Tensor, "B n r K"] | None:
@@ -27,6 +28,8 @@ def relations_width(task: Task, network: str) -> int:
 
 def require_decisions(task: Task, network: str, moves: str, hold: int) -> None:
     """Raise ValueError for a network, a menu or a time that a task's decisions cannot have."""
+    if not task.flat:
+        raise ValueError(f"obs=dict does not fit: policies of {task.name} read a flat observation")
     if network == "candidates" and not hasattr(task, "targets_of"):
         raise ValueError(f"network=candidates scores exchanges; {task.name} has none to choose")
     if moves != "none" and task.choices is not None:

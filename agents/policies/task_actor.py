@@ -97,7 +97,7 @@ class TaskActor(Learned):
             "squash": squash,
         }
         more = (f"{RELATIONS[network]}[{features}]",) if features else ()
-        self.features = (f"observation[{observation}]", *more)  # type: ignore[misc]
+        self.features = (f"observation[{observation}]", *more)
         self.network, self.discrete, self.squash = network, discrete, SQUASHES[squash]
         self.first = Layer(observation, hidden)
         self.neighbours = Neighbours(hidden, features) if network == "attention" else None

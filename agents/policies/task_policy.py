@@ -7,7 +7,8 @@ from agents.policies.decisions import relations
 from agents.policies.moves import table
 from agents.policies.task_actor import TaskActor
 from agents.tasks.registry import make_task
-from agents.tasks.task import Seen, Task
+from agents.tasks.rules import Seen
+from agents.tasks.task import Task
 from agents.weights import learned
 
 
@@ -15,7 +16,8 @@ class TaskPolicy:
     """An actor in a task: decisions held as it was trained to, its memory going from step to step.
 
     It draws choices where it was trained to (the likeliest of equals would collide for ever on a
-    channel); else it takes the likeliest, or the mean. An episode's first step is noticed; one object is good for one set of worlds at a time.
+    channel); else it takes the likeliest, or the mean. An episode's first step is noticed; one
+    object is good for one set of worlds at a time.
     """
 
     def __init__(self, task: Task, actor: TaskActor) -> None:
@@ -39,7 +41,7 @@ class TaskPolicy:
 
     def _decide(self, seen: Seen) -> Tensor:
         training, actor = self.actor.training, self.actor.eval()
-        more = relations(self.task, seen.memory, actor.network)
+        more = relations(seen.task, seen.memory, actor.network)
         out, self._memory = actor(seen.observation, seen.mask, more, self._memory)
         actor.train(training)
         if not actor.discrete:
@@ -62,11 +64,12 @@ def load_policy(task: Task, weights: str) -> TaskPolicy:
     trained = make_task(actor.architecture["task"])
     if trained.name != task.name:
         raise ValueError(f"{weights} was trained on {trained.name}, not on {task.name}")
-    width = task.leaves["observation"].width
-    if actor.architecture["observation"] != width:
+    if not task.flat:
+        raise ValueError(f"{weights} reads a flat observation: obs=flat is needed")
+    known, width = actor.architecture["observation"], task.leaves["observation"].width
+    if known != width:
         raise ValueError(
-            f"{weights} was trained on observations of {actor.architecture['observation']} numbers: "
-            f"this {task.name} has {width}"
+            f"{weights} reads observations of {known} numbers: this {task.name} has {width}"
         )
     actor.requires_grad_(False)
     return TaskPolicy(task, actor)

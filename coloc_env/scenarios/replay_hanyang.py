@@ -1,5 +1,7 @@
 """``replay-hanyang-v0``: a tag in the plane among four anchors that stand together (Hanyang)."""
 
+from dataclasses import replace as replaced
+
 from coloc_env.options import Metres, Seconds, WhiteAcceleration
 from coloc_env.scenario import ConstantVelocity, PriorOptions, Reward, Scenario
 from coloc_env.scenarios.parts.replays import BiasOptions, ReplayOptions
@@ -33,4 +35,5 @@ def replay_hanyang(
     grid = ranging_grid(recording, replay, margin=0.04)
     start, model = prior.at_start(0.1, 0.2), ConstantVelocity(velocity_accel_std)
     noise = biases.noise(range_std)
-    return anchor_scenario("replay-hanyang-v0", recording, grid, start, model, noise, reward)
+    built = anchor_scenario("replay-hanyang-v0", recording, grid, start, model, noise, reward)
+    return replaced(built, tuned_on=("LOS/Trajectory_B/Case_3",))

@@ -99,4 +99,5 @@ def replay_miluv(
         process=model,
         believed_sensors=tuple(believed),
         reward=reward,
+        tuned_on=("cirObstacles_3_random_0",),
     )

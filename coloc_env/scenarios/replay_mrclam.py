@@ -82,4 +82,5 @@ def replay_mrclam(
         process=Wheeled(),
         believed_sensors=(odometry, landmarks, robots),
         reward=reward,
+        tuned_on=("MRCLAM_Dataset6",),  # its first 250 s
     )

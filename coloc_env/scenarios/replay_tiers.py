@@ -87,4 +87,5 @@ def replay_tiers(
         believed_sensors=(*own, ranging),
         reward=reward,
         anchor_uavs=len(anchor_robots),
+        tuned_on=("4robots_data_01",),  # its first 60 s
     )

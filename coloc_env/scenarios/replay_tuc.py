@@ -1,5 +1,6 @@
 """``replay-tuc-v0``: one wheeled robot among four anchors in the plane (TU Chemnitz)."""
 
+from dataclasses import replace as replaced
 from typing import Literal
 
 from coloc_env.options import AngularRate, Coordinate, Metres, Speed, WhiteAcceleration
@@ -41,4 +42,5 @@ def replay_tuc(
         model, odometry = Wheeled(), Odometry(forward_std, 0.5 * forward_std, turn_std)
     start = prior.at_start(0.1, 0.2)
     noise = biases.noise(range_std)
-    return anchor_scenario("replay-tuc-v0", recording, grid, start, model, noise, reward, odometry)
+    built = anchor_scenario("replay-tuc-v0", recording, grid, start, model, noise, reward, odometry)
+    return replaced(built, tuned_on=("Indoor_UWB",))  # its first 15 s

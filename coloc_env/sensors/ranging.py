@@ -207,8 +207,8 @@ class AnchorRanging(Sensor):
         if self.radius is not None:
             mask = mask & (distance <= self.radius)
         if self.walls:
-            ends = torch.broadcast_tensors(tags.unsqueeze(-2), tags.unsqueeze(-2) - apart)
-            mask = mask & (depth(*ends, self.walls) == 0)
+            own = tags.unsqueeze(-2).expand_as(apart)
+            mask = mask & (depth(own, own - apart, self.walls) == 0)
         if lost is not None:
             mask = mask & ~lost
         mask = mask.to(torch.float32)

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.recordings import recordings
 from training.cli.render import render
 from training.cli.report import report
 from training.cli.reproduce import reproduce
@@ -68,6 +69,7 @@ for _command in (
     scenarios,
     agents,
     tasks,
+    recordings,
     render,
     view,
     bench,

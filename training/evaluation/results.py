@@ -116,6 +116,12 @@ class Evaluation:
             | {name: self._no_metrics(error) for name, error in self.errors.items()},
         }
 
+    def _repr_html_(self) -> str:
+        """The main table, in notebooks."""
+        from training.evaluation.tables import html_table
+
+        return html_table(self)
+
     def _metrics(self, agent: str) -> dict[str, Any]:
         one, scored = self.agents[agent], self.worlds.scored
         errors, per_run = one.error[scored], metrics.rmse_per_run(one.error, scored)

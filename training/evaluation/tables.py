@@ -1,6 +1,7 @@
 """Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -73,6 +74,16 @@ def markdown(results: Evaluation) -> str:
     if results.dropped:
         text += ["", left_out(results)]
     return "\n".join(text) + "\n"
+
+
+def html_table(results: Evaluation) -> str:
+    """The main table as notebooks show it."""
+    lines = [["", *COLUMNS.values()], *rows(results)]
+    cells = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in line)
+        for line, tag in zip(lines, ["th", *["td"] * (len(lines) - 1)], strict=True)
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in cells) + "</table>"
 
 
 def left_out(results: Evaluation) -> str:

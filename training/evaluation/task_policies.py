@@ -10,7 +10,7 @@ from torch import Tensor
 
 from agents.tasks.rules import Policy, Seen
 from agents.tasks.task import Task
-from agents.weights import SUFFIX
+from agents.weights import SUFFIX, shipped
 
 Observations = dict[str, Any]
 WorldPolicy = Callable[[Observations, Observations], Mapping[str, Any]]
@@ -18,12 +18,13 @@ WorldPolicy = Callable[[Observations, Observations], Mapping[str, Any]]
 
 def find_policies(task: Task, names: str) -> list[Policy]:
     """Each of some policies, separated by commas: a heuristic of the task, a checkpoint
-    (``….safetensors``), or somebody's own ``module:function``. ValueError for one that is none."""
+    (``….safetensors``, or a shipped one's name), or somebody's own ``module:function``. ValueError
+    for one that is none."""
     return [_find(task, name) for name in names.split(",")]
 
 
 def _find(task: Task, name: str) -> Policy:
-    if name.endswith(SUFFIX):
+    if name.endswith(SUFFIX) or name in shipped():
         from agents.policies.task_policy import load_policy
 
         learned: Policy = load_policy(task, name)

@@ -150,7 +150,8 @@ def recipe(source: str) -> tuple[str, dict[str, Any]]:
         return _recipe(f"checkpoint {source}", card_of(source))
     file = Path(source)
     if not file.is_file():
-        raise ValueError(f"{file}: no such file, and no checkpoint of that name: {', '.join(shipped())}")
+        known = ", ".join(shipped())
+        raise ValueError(f"{file}: no such file, and no checkpoint of that name: {known}")
     return _recipe(str(file), read_json(file, "a training's config", fields))
 
 

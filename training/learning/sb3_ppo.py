@@ -92,7 +92,9 @@ class Sb3Trainer:
             self.model._last_obs = None  # the epoch's worlds start now
             rate = self.rate * (1 - self.epoch / self.epochs)
             self.model.lr_schedule = partial(_constant, rate)
-            self.model.learn(frames, self.figures(), log_interval=frames + 1, reset_num_timesteps=False)
+            self.model.learn(
+                frames, self.figures(), log_interval=frames + 1, reset_num_timesteps=False
+            )
             self.collected_frames = self.model.num_timesteps
             self.epoch += 1
             self.export()

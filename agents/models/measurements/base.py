@@ -106,11 +106,13 @@ def noise_std(std: float) -> float:
 
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
-    that marks which of its measurements are there (None: a single one, always). ``depth``: how many
-    measurements of one link a step can have. ``bias_std`` of each number that a link measures
-    (empty: none is believed to be biased), over ``bias_time`` s."""
+    that marks which of its measurements are there (None: a single one, always). ``testable`` is
+    false for a belief that enters like a measurement, and says nothing of who predicts well.
+    ``depth``: how many measurements of one link a step can have. ``bias_std`` of each number that a
+    link measures (empty: none is believed to be biased), over ``bias_time`` s."""
 
     cooperative = False
+    testable = True
     mask_leaf: str | None = None
     depth = 1
     bias_std: tuple[float, ...] = ()

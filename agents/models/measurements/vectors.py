@@ -141,6 +141,8 @@ class Heights(_Coordinates):
 class Slowness(_Coordinates):
     """Velocity about zero."""
 
+    testable = False
+
     def components(self, dim: int) -> slice:
         return slice(dim, 2 * dim)
 

@@ -7,7 +7,6 @@ those that scores are made of. All UAVs share one policy. The critic sees its ow
 (IPPO), or the team's observations and true state beside it (MAPPO).
 """
 
-from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from typing import Annotated, Any
 
@@ -29,16 +28,14 @@ from agents.policies.task_actor import NETWORKS, TaskActor
 from agents.tasks import make_task
 from agents.tasks.task import Task
 from agents.weights import drawn_from
-from coloc_env.options import Count, Factor, OneOf, PositiveCount, Share
+from coloc_env.options import Factor, OneOf, PositiveCount, Share
 from training.learning.collectors import EpochCollector, Epochs, Seed, Width, Worlds, world_seed
 from training.learning.run import Training, make_trainer
 from training.learning.tasks.environment import environment
-from training.learning.tasks.rewards import REWARDS
 from training.learning.tasks.scoring import ScoreWorlds, score
 
 Network = Annotated[str, OneOf(NETWORKS)]
 Moves = Annotated[str, OneOf(("none", *MOVES))]
-RewardName = Annotated[str, OneOf(tuple(REWARDS))]
 
 _UAV = "uav"
 _DECIDED = (_UAV, "decision")  # a choice, or numbers: what the policy draws
@@ -109,23 +106,19 @@ def acting(policy: nn.Module, actor: TaskActor, task: Task) -> Any:
 
 
 class Critic(nn.Module):
-    """The value of a UAV's observation, and, where ``state`` says the bounds of one, of the team's
-    observations and of its true state; in units of ``unit``, which is what returns spread by at
+    """The value of a UAV's observation, and, where a ``state`` of some width is known, of the
+    team's observations and of that; in units of ``unit``, which is what returns spread by at
     first."""
 
     unit: Tensor
 
-    def __init__(self, width: int, hidden: int, state: tuple[Tensor, Tensor] | None) -> None:
+    def __init__(self, width: int, hidden: int, state: int) -> None:
         super().__init__()
         self.own, self.second = nn.Linear(width, hidden), nn.Linear(hidden, hidden)
         self.head = nn.Linear(hidden, 1)
         self.register_buffer("unit", torch.ones(()))
-        if state is not None:
-            low, high = state
-            self.register_buffer("middle", 0.5 * (low + high))
-            self.register_buffer("extent", 0.5 * (high - low))
-            self.team = nn.Linear(width, hidden)
-            self.truth = nn.Linear(len(low), hidden)
+        if state:
+            self.team, self.truth = nn.Linear(width, hidden), nn.Linear(state, hidden)
 
     @torch.no_grad()
     def fit(self, reward: Float32[Tensor, "B T n 1"], gamma: float) -> None:
@@ -142,7 +135,7 @@ class Critic(nn.Module):
         x = self.own(observation)
         if state is not None:
             x = x + torch.tanh(self.team(observation)).mean(-2, keepdim=True)
-            x = x + self.truth((state - self.middle) / self.extent).unsqueeze(-2)
+            x = x + self.truth(state).unsqueeze(-2)
         return self.head(torch.tanh(self.second(torch.tanh(x))))
 
 
@@ -154,7 +147,7 @@ def _ppo(
     network: Network = "feedforward",
     moves: Moves = "none",
     hold: PositiveCount = 1,
-    reward: RewardName = "own",
+    difference: bool = False,
     hidden: Width = 64,
     worlds: Worlds = 64,
     epochs: Epochs = 60,
@@ -183,21 +176,17 @@ def _ppo(
             moves,
             hold,
             relations_width(made, network),
-            sampled=made.choices is not None,
+            sampled=made.sampled,
         )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
-        return environment(made, count, first, hold=hold, reward=reward, network=network)
+        return environment(made, count, first, hold=hold, difference=difference, network=network)
 
     central = loss_class is MAPPOLoss
-    spec = worlds_of(0, 1).observation_spec["state"].space
+    state = worlds_of(0, 1).observation_spec["state"].shape[-1] if central else 0
     with drawn_from(seed + 1):
-        critic = Critic(
-            made.leaves["observation"].width,
-            hidden,
-            (spec.low[0], spec.high[0]) if central else None,
-        )
+        critic = Critic(made.leaves["observation"].width, hidden, state)
     reader, policy = policy_of(actor, made)
     reads: list[Any] = [(_UAV, "observation"), *(["state"] if central else [])]
     value = TensorDictModule(critic, reads, [(_UAV, "state_value")])
@@ -281,9 +270,9 @@ def task_mappo(**options: Any) -> Training:
     them) from their start to the horizon and learns from them in ``passes`` passes. ``network``:
     recurrent, graph attention over neighbours, or one that scores each candidate exchange.
     ``moves``: choices in place of velocities; ``hold``: for how many steps each decision is held.
-    ``reward``: the task's own, the filter's own σ in the error's place, a soft gate, or what each
-    call was worth to the team. Learning rate and entropy bonus fall linearly. At the end the policy
-    meets ``score_worlds`` of the protocol's worlds.
+    ``difference``: each call is rewarded by what it was worth to the team; the task's own option
+    ``reward=sigma`` rewards the filter's σ in place of the true error. Learning rate and entropy
+    bonus fall linearly. At the end the policy meets ``score_worlds`` of the protocol's worlds.
     """
     return _ppo("task-mappo", MAPPOLoss, **options)
 

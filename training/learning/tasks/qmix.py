@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
 from torchrl.modules import EGreedyModule, QMixer, QValueModule
@@ -26,25 +25,12 @@ from coloc_env.options import Factor, OpenShare, PositiveCount, Share
 from training.learning.collectors import EpochCollector, Epochs, Seed, Width, Worlds, world_seed
 from training.learning.run import Training, make_trainer
 from training.learning.tasks.environment import environment
-from training.learning.tasks.ppo import Moves, Network, Reader, RewardName, acting, figures
+from training.learning.tasks.ppo import Moves, Network, Reader, acting, figures
 from training.learning.tasks.scoring import ScoreWorlds, score
 
 _UAV = "uav"
 _VALUES, _CHOSEN = (_UAV, "action_value"), (_UAV, "chosen_action_value")
 _DECIDED = (_UAV, "decision")
-
-
-class Mixer(nn.Module):
-    """TorchRL's mixer of the state within its bounds: [*s, n, 1] values → [*s, 1]."""
-
-    def __init__(self, low: Tensor, high: Tensor, n: int, hidden: int) -> None:
-        super().__init__()
-        self.register_buffer("middle", 0.5 * (low + high))
-        self.register_buffer("extent", 0.5 * (high - low))
-        self.mixer = QMixer(low.shape, hidden, n, "cpu")
-
-    def forward(self, chosen: Tensor, state: Tensor) -> Tensor:
-        return self.mixer(chosen, (state - self.middle) / self.extent)
 
 
 class Kept:
@@ -71,7 +57,7 @@ def task_qmix(
     network: Network = "feedforward",
     moves: Moves = "none",
     hold: PositiveCount = 1,
-    reward: RewardName = "own",
+    difference: bool = False,
     hidden: Width = 64,
     worlds: Worlds = 16,
     epochs: Epochs = 60,
@@ -117,11 +103,11 @@ def task_qmix(
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
-        return environment(made, count, first, hold=hold, reward=reward, network=network)
+        return environment(made, count, first, hold=hold, difference=difference, network=network)
 
-    spec = worlds_of(0, 1).observation_spec["state"].space
+    state = worlds_of(0, 1).observation_spec["state"].shape[-1:]
     with drawn_from(seed + 1):
-        mixer = Mixer(spec.low[0], spec.high[0], made.n_agents, 32)
+        mixer = QMixer(state, 32, made.n_agents, "cpu")
     reader = Reader(actor, made.choices is not None)
     values = TensorDictSequential(
         TensorDictModule(reader, reader.keys, [_VALUES]),
@@ -135,9 +121,7 @@ def task_qmix(
         values, TensorDictModule(mixer, [_CHOSEN, "state"], ["chosen_action_value"]),
         action_space="categorical",
     )  # fmt: skip
-    loss.set_keys(
-        action=_DECIDED, action_value=_VALUES, local_value=_CHOSEN, reward="team_reward"
-    )
+    loss.set_keys(action=_DECIDED, action_value=_VALUES, local_value=_CHOSEN, reward="team_reward")
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
     explore = EGreedyModule(

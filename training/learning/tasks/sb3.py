@@ -84,7 +84,7 @@ def task_sb3_ppo(
         outputs=outputs,
         discrete=discrete,
         hidden=hidden,
-        sampled=discrete,
+        sampled=made.sampled,
         squash="clip",
     )
     worlds_env = CoLocVecEnv(made.scenario, worlds, action=made)

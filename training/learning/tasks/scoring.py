@@ -5,10 +5,10 @@ from typing import Annotated, Any
 
 import torch
 
+from agents.policies.task_actor import TaskActor
 from agents.policies.task_policy import TaskPolicy
 from agents.tasks import make_task
 from agents.tasks.runner import rollout
-from agents.policies.task_actor import TaskActor
 from coloc_env.options import Quantity
 from training.evaluation.score import FIRST_SEED, WORLDS
 from training.learning.run import Progress
@@ -20,7 +20,7 @@ def score(actor: TaskActor, worlds: int, progress: Progress) -> Mapping[str, Any
     """Mean return, with its standard error, in the first so many of the protocol's worlds."""
     if worlds == 0:
         return {}
-    task = make_task(actor.architecture["task"])
+    task = make_task(actor.architecture["task"]).with_options(reward="true")
     policy = TaskPolicy(task, actor)
     total = torch.zeros(worlds, dtype=torch.float64)
     horizon = task.scenario.horizon
