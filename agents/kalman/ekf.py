@@ -6,6 +6,7 @@ uncertainty. What the UAVs' estimates have in common is ignored by that (``fusio
 filter can grow overconfident; the other methods of fusion are not, at a price.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -84,17 +85,24 @@ class CooperativeEkf(GaussianFilter):
         """The filter; with ``fusion=exchange``, or a fusion of late messages, what works so.
 
         Raises ValueError for options that the fusion does not have."""
+        cls.require_sense(options)
         fusion = options.get("fusion", "naive")
-        if fusion != "ci" and options.get("second_order"):
-            raise ValueError(f"second_order=true is not allowed with fusion={fusion}: ci")
-        if fusion != "pairwise" and "partners" in options:
-            raise ValueError(f"partners is not allowed with fusion={fusion}: only with pairwise")
-        if fusion == "exchange" and cls is CooperativeEkf:
+        if fusion == "exchange":
             chosen = {name: options[name] for name in options.keys() - _OTHERS}
             return ExchangingEkf(believed, **chosen)
+        one = cls(believed, **options)
         if fusion == "pairwise" and believed.message_delay:
-            return LateFusion(believed, cls(believed, **options))
-        return cls(believed, **options)
+            return LateFusion(believed, one)
+        return one
+
+    @staticmethod
+    def require_sense(options: Mapping[str, Any]) -> None:
+        """Raise ValueError for options that the fusion does not have."""
+        fusion = options.get("fusion", "naive")
+        if fusion != "ci" and options.get("second_order"):
+            raise ValueError(f"second_order=true is not allowed with fusion={fusion}: only with ci")
+        if fusion != "pairwise" and "partners" in options:
+            raise ValueError(f"partners is not allowed with fusion={fusion}: only with pairwise")
 
     @property
     def exchanges(self) -> bool:

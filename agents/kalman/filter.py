@@ -52,6 +52,18 @@ class Beside:
     step: Int64[Tensor, "B N"]
 
 
+def predict(
+    process: Process, belief: GaussianBelief, observation: Observation
+) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N E E"]]:
+    """Mean and covariance at the observation's step, before its measurements are used, and the
+    transition F that led there."""
+    dt = elapsed(process, belief.step).double()
+    u = process.inputs(observation)
+    f, q = process.linearize(belief.state, u, dt)
+    x = process.propagate(belief.state, u, dt)  # x⁻ = f(x, u)
+    return x, f @ belief.covariance @ f.mT + q, f  # P⁻ = F P Fᵀ + Q
+
+
 def gaussian_estimate(
     process: Process, x: Float[Tensor, "B N S"], covariance: Float[Tensor, "B N E E"]
 ) -> Estimate:
@@ -98,11 +110,7 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
-        dt = elapsed(self.process, belief.step).double()
-        u = self.process.inputs(observation)
-        f, q = self.process.linearize(belief.state, u, dt)
-        x = self.process.propagate(belief.state, u, dt)  # x⁻ = f(x, u)
-        covariance = f @ belief.covariance @ f.mT + q  # P⁻ = F P Fᵀ + Q
+        x, covariance, f = predict(self.process, belief, observation)
         prior = Prediction(x, covariance, observation, belief.memory)
         considered = self.biases.predict(belief.considered, f, observation)
         beside = Beside(considered, self.moved(belief.shared, f), belief.step)
