@@ -7,7 +7,7 @@ from math import inf
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from coloc_env.motion import Arena, Motion
-from coloc_env.network import Network
+from coloc_env.network import Links, Network
 from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Share
 from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor
@@ -148,6 +148,7 @@ class Believed:
 
     Positions of landmarks and anchors come in the observation's map leaves. ``largest_command``:
     where motion is steered, the largest component of a command (m/s or m/s²) that has any effect.
+    ``links``: who exchanges with whom (see ``Network``).
     """
 
     arena: Arena
@@ -157,6 +158,7 @@ class Believed:
     prior: Prior
     message_delay: int = 0
     largest_command: float = 0.0
+    links: Links = "all"
 
     def sensor(self, kind: type[S]) -> S | None:
         """The believed model of a sensor type, or None if the team has no such sensor."""
@@ -232,6 +234,7 @@ class Scenario:
             prior=self.believed_prior or self.prior,
             message_delay=self.network.delay,
             largest_command=self.motion.largest,
+            links=self.network.links,
         )
 
     @property

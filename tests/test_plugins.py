@@ -55,6 +55,25 @@ def test_it_is_evaluated(installed: dict[str, str], tmp_path: Path) -> None:
     assert figures["ekf"]["rmse"] < 0.5 < figures["anchor_mean:nearest=2"]["rmse"] < 10
 
 
+def test_a_sensor_is_used_and_bounded(installed: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [
+        "--agents",
+        "dead_reckoning,ekf",
+        "--runs",
+        "2",
+        "--set",
+        "horizon=100",
+        "--no-figures",
+    ]
+    done = coloc(installed, "evaluate", "beacon-v0", *words, "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    found = json.loads((out / "results.json").read_text())
+    figures = found["agents"]
+    assert figures["ekf"]["rmse"] < 0.5 * figures["dead_reckoning"]["rmse"]
+    assert 0.8 < figures["ekf"]["rmse"] / found["bound"]["rmse"] < 1.6
+
+
 def test_what_does_not_fit_is_refused_in_one_line(installed: dict[str, str]) -> None:
     words = ["--agents", "anchor_mean", "--runs", "1", "--out", "nowhere"]
     done = coloc(installed, "evaluate", "indoor-v0", *words)

@@ -15,7 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.filter import GaussianFilter
-from agents.models.measurements import Block, Neighbours, make_measurements, received
+from agents.models.measurements import (
+    Block,
+    Measurement,
+    Neighbours,
+    make_measurements,
+    received,
+)
+from agents.models.measurements.second_order import expanded
+from agents.models.ordered_update import by_kind, pick
 from agents.models.update import information, iterated_update, posterior
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
@@ -34,7 +42,8 @@ class CooperativeEkf(GaussianFilter):
     agree with most others, ``temporal`` what does not agree with the last two steps, ``cross`` what
     neighbours' measurements contradict. ``fusion``: ``naive``, or ``ci`` (split covariance
     intersection for everything that involves a neighbour). ``iterations`` of each update.
-    ``cooperate=false`` leaves other UAVs out.
+    ``cooperate=false`` leaves other UAVs out. ``second_order``, with ``fusion=ci``: ranges are
+    expanded to the second order, as ``ekf_joint`` has them, where priors are broad too.
     """
 
     name = "ekf"
@@ -48,9 +57,13 @@ class CooperativeEkf(GaussianFilter):
         fusion: Literal["naive", "ci"] = "naive",
         iterations: PositiveCount = 2,
         cooperate: bool = True,
+        second_order: bool = False,
     ) -> None:
         super().__init__(believed)
+        if second_order and fusion != "ci":
+            raise ValueError(f"ekf: second_order=true is not allowed with fusion={fusion}: ci")
         self.iterations, self.fusion = iterations, fusion
+        self.second_order = second_order
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
 
@@ -67,6 +80,8 @@ class CooperativeEkf(GaussianFilter):
         if not self.models:
             return super().update(prior)
         neighbours = received(self.believed, prior.observation)
+        if self.second_order:
+            return self._expanded(prior, neighbours)
         found = iterated_update(prior, neighbours, self.screen, self.iterations)
         if self.fusion == "naive":
             return found.state, found.covariance, found.memory
@@ -92,6 +107,50 @@ class CooperativeEkf(GaussianFilter):
             blocks = [m.linearize(self.process, x, prior.observation, neighbours) for m in models]
             x, covariance = self._intersect(x, covariance, blocks, fixed)
         return x, covariance
+
+    def _expanded(
+        self, prior: Prediction, neighbours: Neighbours
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
+        """As ``_split``, with ranges' second-order terms, in one iteration."""
+        x, covariance = prior.state, prior.covariance
+        blocks = self._blocks(x, covariance, prior, neighbours, self.models)
+        evidence = self.screen.judge(blocks, prior)
+        trusts = self.screen.weigh(blocks, evidence, True)
+        own, shared = by_kind(self.models)
+        if own:
+            known = information(pick(blocks, own), pick(trusts, own))
+            delta, covariance = posterior(covariance, *known)
+            x = self.process.boxplus(x, delta)
+        if shared:
+            models = pick(self.models, shared)
+            blocks = self._blocks(x, covariance, prior, neighbours, models)
+            x, covariance = self._intersect(x, covariance, blocks, pick(trusts, shared))
+        memory = self.screen.remember(
+            prior, evidence, lambda: self._blocks(x, covariance, prior, neighbours, self.models)
+        )
+        return x, covariance, memory
+
+    def _blocks(
+        self,
+        x: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N E E"],
+        prior: Prediction,
+        neighbours: Neighbours,
+        models: Sequence[Measurement],
+    ) -> list[Block]:
+        """Measurements linearized at a state, ranges expanded to the second order."""
+        d, observation = self.process.dim, prior.observation
+        own = covariance[..., None, :d, :d]
+        apart = own + torch.diag_embed(neighbours.variance)
+        return [
+            expanded(
+                model,
+                model.linearize(self.process, x, observation, neighbours),
+                apart if model.cooperative else own,
+                observation,
+            )
+            for model in models
+        ]
 
     def _intersect(
         self,

@@ -15,7 +15,7 @@ from torch import Tensor
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, Neighbours, make_measurements
-from agents.models.measurements.ranges import AnchorRanges, UavRanges
+from agents.models.measurements.second_order import expanded
 from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.models.process import make_process
 from agents.models.update import posterior
@@ -173,29 +173,16 @@ class JointEkf(Localizer[GaussianBelief]):
     def _expanded(
         self, blocks: Sequence[Block], p: Float[Tensor, "B M M"], observation: Observation
     ) -> list[Block]:
-        """The blocks with ranges' second-order terms: E r ≈ r̂ + ½ σ_⊥² / r̂, whose variance is
-        ½ (σ_⊥² / r̂)²; σ_⊥² is the relative variance across the line."""
+        """The blocks with ranges' second-order terms."""
         d, e = self.process.dim, self.process.error_size
         joint = p.unflatten(-1, (-1, e)).unflatten(1, (-1, e))[:, :, :d, :, :d]
         joint = joint.transpose(2, 3)  # [B, N, N, d, d]
-        own = joint.diagonal(dim1=1, dim2=2).movedim(-1, 1)  # [B, N, d, d]
-        found = []
-        for model, block in zip(self.models, blocks, strict=True):
-            if not isinstance(model, UavRanges | AnchorRanges) or model.tags:
-                found.append(block)
-                continue
-            relative = own.unsqueeze(2)
-            if model.cooperative:
-                relative = relative + own.unsqueeze(1) - joint - joint.transpose(1, 2)
-            unit = block.jacobian[..., 0, :d]  # [B, N, m, d]
-            along = ((relative @ unit.unsqueeze(-1))[..., 0] * unit).sum(-1)
-            across = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - along
-            measured = model.read(observation)[0].to(across.dtype)
-            distance = (measured - block.residual[..., 0]).clamp_min(1e-3)
-            longer = (0.5 * across.clamp_min(0.0) / distance).unsqueeze(-1)
-            residual, variance = block.residual - longer, block.variance + 2 * longer**2
-            found.append(replace(block, residual=residual, variance=variance))
-        return found
+        own = joint.diagonal(dim1=1, dim2=2).movedim(-1, 1).unsqueeze(2)  # [B, N, 1, d, d]
+        apart = own + own.transpose(1, 2) - joint - joint.transpose(1, 2)
+        return [
+            expanded(model, block, apart if model.cooperative else own, observation)
+            for model, block in zip(self.models, blocks, strict=True)
+        ]
 
     def _with_partners(self, block: Block, p: Float[Tensor, "B M M"]) -> Block:
         """The block as one UAV alone would judge it: with what its partners do not know of

@@ -29,6 +29,7 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors.base import usable
 
 _M = TypeVar("_M", bound=SwarmFilter)
 _SURVEYED = 1e-3  # m: standard deviation of anchors' positions, per axis
@@ -165,16 +166,19 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         """What the members observe: links, and fixes of anchors and of UAVs that have one. Their
         positions are predicted already, so that their velocity is zero."""
         n = links.mask.shape[-1] - anchors.shape[1]
-        fix, fixed = (anchors.new_zeros(len(anchors), n, k) for k in (self.process.dim, 1))
+        fix = anchors.new_zeros(len(anchors), n, self.process.dim)
+        fixed = torch.zeros_like(fix[..., :1], dtype=torch.bool)
         if self.fixed is not None:
-            fix, fixed = observation["position_fix"].double(), observation["position_fix_mask"]
+            there = observation["position_fix_mask"] > 0
+            z, fixed = usable(observation["position_fix"].double().unsqueeze(-2), there)
+            fix = z[..., 0, :]
         fix = torch.cat((fix, anchors), 1)
         leaves = {
             "ins": torch.zeros_like(fix),
             "ranges": links.distance,
             "range_mask": links.mask,
             "position_fix": fix,
-            "position_fix_mask": torch.cat((fixed > 0, torch.ones_like(anchors[..., :1]) > 0), 1),
+            "position_fix_mask": torch.cat((fixed, torch.ones_like(anchors[..., :1]) > 0), 1),
         }
         return Observation(leaves)
 

@@ -19,6 +19,7 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors.base import usable
 
 _MIN_VARIANCE = 1e-6  # m² per axis: of a prior that is believed to be exact
 
@@ -220,8 +221,9 @@ class SwarmFilter(Localizer[SwarmBelief]):
         sensor = self.believed.sensor(PositionFix)
         if sensor is None:
             return torch.zeros_like(position[..., 0], dtype=torch.bool), position, 0.0
-        fixed = observation["position_fix_mask"][..., 0] > 0
-        fix = observation["position_fix"].double()
+        there = observation["position_fix_mask"] > 0
+        z, there = usable(observation["position_fix"].double().unsqueeze(-2), there)
+        fix, fixed = z[..., 0, :], there[..., 0]
         return fixed, torch.where(fixed.unsqueeze(-1), fix, position), sensor.std**2
 
     def _links(

@@ -22,7 +22,8 @@ rule out large errors.
   a Gaussian of covariance J⁻¹, and is tight once that is small against distances and a radian.
 - Of noise that is not Gaussian only the Fisher information enters: the bound holds, but a filter
   with few measurements per step does not reach it. Which ranges are NLOS is known where that lasts.
-- IMU, INS and odometry noise, of known statistics, is process noise. With ``ConstantVelocity`` the
+- IMU, INS and odometry noise, of known statistics, is process noise, and so is what missing samples
+  of a recording leave unknown. With ``ConstantVelocity`` the
   process noise is the model's: scripted motion is smoother, and a filter may do better than that.
 - The information that visibility itself holds is left out; a delayed measurement counts as if made
   when it arrives; the landmark that a false match shows is known (see ``information``); a uniform
@@ -119,7 +120,7 @@ def _bound(
     mse, scored = [], []
     for step, (truth, seen, counts) in enumerate(worlds(scenario, seeds, steps)):
         if before is not None:
-            f, q = model.transition(before, truth)
+            f, q = model.transition(before, truth, seen)
             covariance = predict(covariance, _by_team(f, n), _by_team(q, n))
         root = torch.linalg.cholesky(covariance)
         keys = noise.fold(noise.row_keys(seeds), step)

@@ -2,8 +2,8 @@
 
 Step k is at ``start + k dt``. Nothing measured is interpolated or invented: a step delivers what
 arrived in (t_{k−1}, t_k]; what drives a motion model (IMU, odometry) is integrated over that
-interval exactly, each sample held until the next. An IMU's sample is held for 0.1 s at most: beyond
-that its mean stands for it, and how wrong that may be is given with it.
+interval exactly, each sample held until the next, but no longer than it may stand for (an IMU's for
+0.1 s): beyond that the stream's mean does, and how wrong that may be is given with it.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ _TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this clo
 _TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
 _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
-_HELD = 100_000_000  # ns, for which a sample of an IMU stands
+_PHASES = 32  # of a step, tried
+_LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
@@ -40,8 +41,9 @@ class Grid:
 
 
 def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Grid:
-    """Steps over the longest span in which all robots have truth and every driving stream."""
-    spans = [(t.time[0], t.time[-1]) for t in recording.truth]
+    """Steps over the longest span in which all robots that have truth have it, and every driving
+    stream; without any of either, from the first sample of a stream to the last."""
+    spans = [(t.time[0], t.time[-1]) for t in recording.truth if len(t.time)]
     for name in drivers:
         tables = recording.streams.get(name, ())
         if not tables or not all(len(table.time) for table in tables):
@@ -49,11 +51,57 @@ def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Gr
         spans += [(table.time[0], table.time[-1]) for table in tables]
     if not _LEAST_DT <= dt < np.inf:
         raise ValueError(f"dt={dt} is not allowed: a time in s from {_LEAST_DT}")
+    if not spans:
+        every = [t.time for team in recording.streams.values() for t in team if len(t.time)]
+        if not every:
+            raise DataError(f"{recording.name} has neither truth nor measurements")
+        spans = [(min(time[0] for time in every), max(time[-1] for time in every))]
     start, end = max(s for s, _ in spans), min(e for _, e in spans)
     count = int((end - start) // round(dt * 1e9)) + 1
     if count < 2:
         raise DataError(f"{recording.name}: its streams overlap for less than one step of {dt} s")
     return Grid(int(start), dt, count)
+
+
+def aligned(grid: Grid, recording: Recording, streams: tuple[str, ...]) -> Grid:
+    """The grid shifted by less than a step: so that no step delivers a pair's range twice, if that
+    can be, and then so that what some streams measure is as fresh as can be when it is delivered.
+    """
+    tables = [table for name in streams for table in recording.streams[name] if len(table.time)]
+    if not tables or grid.count < 3:
+        return grid
+    period = round(grid.dt * 1e9)
+    time = np.concatenate([table.time for table in tables])
+    pairs = [_links(recording, name) for name in streams if name in _LINKS]
+    best, least = 0, (len(time), np.inf)
+    for offset in (i * period // _PHASES for i in range(_PHASES)):
+        late = time - grid.start - offset
+        age = float((-late % period).mean())
+        twice = sum(_repeats(_delivered(grid, offset, each), link) for each, link in pairs)
+        if (twice, age) < least:
+            best, least = offset, (twice, age)
+    return Grid(grid.start + best, grid.dt, grid.count - (best > 0))
+
+
+def _delivered(grid: Grid, offset: int, time: Stamps) -> NDArray[np.int64]:
+    """The steps that deliver measurements of some times on the grid shifted by ``offset`` ns."""
+    return -((grid.start + offset - time) // round(grid.dt * 1e9))
+
+
+def _links(recording: Recording, stream: str) -> tuple[Stamps, NDArray[np.int64]]:
+    """Times and links of all measurements of a stream: two of one link must not share a step."""
+    tables = recording.streams[stream]
+    ends = [table.values[:, : _LINKS[stream]].astype(np.int64) for table in tables]
+    owner = np.repeat(np.arange(len(tables)), [len(each) for each in ends])
+    whole = np.column_stack((owner, np.concatenate(ends)))
+    link = np.unique(whole, axis=0, return_inverse=True)[1].reshape(-1)
+    return np.concatenate([table.time for table in tables]), link
+
+
+def _repeats(step: NDArray[np.int64], link: NDArray[np.int64]) -> int:
+    """How many measurements share their step and link with one before."""
+    key = step * (int(link.max(initial=0)) + 1) + link
+    return len(key) - len(np.unique(key))
 
 
 def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
@@ -99,29 +147,27 @@ def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
     return samples, durations
 
 
-def bridged(table: Table) -> tuple[Table, Table, Floats]:
-    """An IMU's samples, and their mean from 0.1 s after the last sample before a hole on; 1 where
-    the mean stands and 0 elsewhere, in the same form; and the deviation of samples from the mean,
-    root mean square an axis: gyro (rad/s), accelerometer (m/s²)."""
-    mean = table.values.mean(0)
-    spread = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))
-    ends = np.flatnonzero(np.diff(table.time) > _HELD)
-    time = np.insert(table.time, ends + 1, table.time[ends] + _HELD)
+def bridged(table: Table, held: float) -> tuple[Table, Table]:
+    """Samples that stand for ``held`` s at most, and their mean from then on until the next; and 1
+    where the mean stands and 0 elsewhere, in the same form."""
+    mean, most = table.values.mean(0), round(held * 1e9)
+    ends = np.flatnonzero(np.diff(table.time) > most)
+    time = np.insert(table.time, ends + 1, table.time[ends] + most)
     values = np.insert(table.values, ends + 1, mean, 0)
     missing = np.insert(np.zeros((len(table.time), 1)), ends + 1, 1.0, 0)
-    return Table(time, values, table.columns), Table(time, missing, ("missing",)), spread
+    return Table(time, values, table.columns), Table(time, missing, ("missing",))
 
 
 def unknown_on(grid: Grid, missing: Table, spread: Floats) -> Floats:
-    """``imu_unknown`` leaf [T, 2]: standard deviations an axis of what the ``imu`` leaf is off for
-    want of samples: accelerometer (m/s²), gyro (rad/s).
+    """Standard deviations [T, F] of what the mean over each step is off for want of samples, which
+    deviate from their mean by ``spread`` [F].
 
-    What was not measured is taken to be off by ``spread`` (gyro, accelerometer) for about a second
-    at a time: white noise that adds up to the same over a hole is √(2 · 1 s / dt) times that.
+    What was not measured is taken to be off by so much for about a second at a time: white noise
+    that adds up to the same over a hole is √(2 · 1 s / dt) times that.
     """
     samples, durations = held_intervals(grid, missing)
     share = (samples[..., 0] * durations).sum(1) / grid.dt
-    return share[:, None] * spread[::-1] * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
+    return share[:, None] * spread * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
 
 
 def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:
@@ -150,10 +196,13 @@ def odometry_on(grid: Grid, table: Table) -> Floats:
     moved, heading = np.zeros((grid.count, 2)), np.zeros(grid.count)
     for slot in range(samples.shape[1]):
         h = durations[:, slot]
-        speed, turn = samples[:, slot, 0] * h, samples[:, slot, 1] * h
+        speed, turn = samples[:, slot, 0] * h, samples[:, slot, -1] * h
         middle = heading + 0.5 * turn
         chord = speed * np.sinc(0.5 * turn / np.pi)
         moved += np.stack((np.cos(middle), np.sin(middle)), 1) * chord[:, None]
+        if samples.shape[2] == 3:  # sideways, too
+            chord = samples[:, slot, 1] * h * np.sinc(0.5 * turn / np.pi)
+            moved += np.stack((-np.sin(middle), np.cos(middle)), 1) * chord[:, None]
         heading += turn
     return np.concatenate((moved, heading[:, None]), 1) / grid.dt
 

@@ -11,6 +11,7 @@ from coloc_env.motion.aggressive import Aggressive
 from coloc_env.motion.base import Arena, Box, Carry, Kinematics, Motion
 from coloc_env.motion.court import Court
 from coloc_env.motion.curves import Circle, FigureEight, Helix
+from coloc_env.motion.followed import Followed
 from coloc_env.motion.formation import FormationChange
 from coloc_env.motion.groups import Groups
 from coloc_env.motion.kidnapped import KidnapOptions, Kidnapped
@@ -54,6 +55,7 @@ __all__ = [
     "ControlOptions",
     "Court",
     "FigureEight",
+    "Followed",
     "FormationChange",
     "Groups",
     "Helix",

@@ -19,12 +19,21 @@ FONT = {
 }
 
 # Okabe and Ito's colours without yellow and black, then two of Tol's: distinct to all eyes.
-_UAVS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#7F7F1F")
+UAV_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#882255",
+    "#7F7F1F",
+)
 
 
 def uav_colours(n_uavs: int) -> np.ndarray:
     """RGB [N, 3] in [0, 1]; beyond eight UAVs the colours come round again."""
-    return np.array([rgb(_UAVS[i % len(_UAVS)]) for i in range(n_uavs)])
+    return np.array([rgb(UAV_COLOURS[i % len(UAV_COLOURS)]) for i in range(n_uavs)])
 
 
 def rgb(colour: str) -> tuple[float, float, float]:

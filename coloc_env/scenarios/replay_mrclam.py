@@ -19,6 +19,8 @@ from coloc_env.sensors import (
     UavBearings,
 )
 
+_HELD = 1.1  # s, for which a command stands: it is repeated at least every 1.03 s
+
 
 def replay_mrclam(
     *,
@@ -55,7 +57,7 @@ def replay_mrclam(
         horizon=grid.count - 1,
         motion=recorded_motion(recording, grid),
         sensors=(
-            recorded_odometry(recording, grid, odometry, odometry_delay, odometry_scale),
+            recorded_odometry(recording, grid, odometry, _HELD, odometry_delay, odometry_scale),
             replace(seen, sensor=landmarks),
             replace(met, sensor=robots),
         ),

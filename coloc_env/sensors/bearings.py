@@ -9,7 +9,16 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import plane_angle, unrotate, wrap_angle
-from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
+from coloc_env.sensors.base import (
+    MASK,
+    Layout,
+    Leaf,
+    Sensor,
+    Window,
+    require,
+    squared_norm,
+    usable,
+)
 from coloc_env.sensors.landmarks import uniform_points
 
 
@@ -53,11 +62,13 @@ class LandmarkBearings(Sensor):
     def fixes(
         self, leaves: Mapping[str, Float32[Tensor, "B N F"]], attitude: Float32[Tensor, "B N a"]
     ) -> tuple[Float32[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
-        distance, bearing = leaves["landmark_bearings"].unflatten(-1, (-1, 2)).unbind(-1)
+        z = leaves["landmark_bearings"].unflatten(-1, (-1, 2))
+        z, there = usable(z, leaves["landmark_bearing_mask"] > 0, ranges=True)
+        distance, bearing = z.unbind(-1)
         heading = attitude + bearing
         apart = distance.unsqueeze(-1) * torch.stack((heading.cos(), heading.sin()), -1)
         points = leaves["landmark_map"].unflatten(-1, (-1, 2)).repeat(1, 1, self.depth, 1)
-        return points - apart, leaves["landmark_bearing_mask"] > 0
+        return points - apart, there
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         require(layout.arena.dim == 2, "LandmarkBearings", "dim", "bearings need a 2-D scenario")

@@ -139,7 +139,7 @@ class AnchorRanging(Sensor):
 
     Entry ``a · A + m`` is between the UAV's own tag ``a`` and anchor ``m``, within ``radius`` m.
     ``blocked``: indices of anchors behind an obstacle, whose ranges all carry the noise's NLOS
-    bias.
+    bias. ``walls``: solid boxes that no range passes.
     """
 
     anchors: tuple[tuple[float, ...], ...]
@@ -147,6 +147,7 @@ class AnchorRanging(Sensor):
     tags: Tags = ()
     radius: float | None = None
     blocked: tuple[int, ...] = ()
+    walls: tuple[Box, ...] = ()
 
     def __post_init__(self) -> None:
         require(len(self.anchors) > 0, self, "anchors", "at least one anchor position")
@@ -195,6 +196,9 @@ class AnchorRanging(Sensor):
             mask = mask & ~window.is_target[:, None, None]
         if self.radius is not None:
             mask = mask & (distance <= self.radius)
+        if self.walls:
+            own = tags.unsqueeze(-2).expand_as(apart)
+            mask = mask & (depth(own, own - apart, self.walls) == 0)
         if lost is not None:
             mask = mask & ~lost
         mask = mask.to(torch.float32)

@@ -211,9 +211,10 @@ def observations() -> str:
         [
             "# Observations\n",
             "What a UAV observes is a Dict of flat float32 Boxes, the *leaves* below: the same "
-            "names and widths on every face. A mask is 1 where an entry was measured and 0 where "
-            "not; masked entries are 0. Maps and the prior stay the same over an episode. The "
-            "frame of quaternions is body to world, wxyz; a body looks forward, left and up.\n",
+            "names and widths on every interface. A mask is 1 where an entry was measured and 0 "
+            "where not; masked entries are 0. Maps and the prior stay the same over an episode. "
+            "The frame of quaternions is body to world, wxyz; a body looks forward, left and "
+            "up.\n",
             table(header, rows),
             "[Action modes](actions.md) for learners add leaves of their own. The page of a "
             "sensor class says how its numbers are laid out.\n",

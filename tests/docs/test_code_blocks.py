@@ -27,7 +27,11 @@ ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("docs/tutorials/*.py")]
 FENCE = re.compile(r"^```(?P<kind>\w+)[^\n]*\n(?P<code>.*?)^```", re.MULTILINE | re.DOTALL)
 INCLUDED = re.compile(r'--8<-- "([^":]+)')
-EXAMPLE = {"corridor-v0", "anchor_mean"}  # of tests/example_package: tests/test_plugins.py
+EXAMPLE = {
+    "beacon-v0",
+    "corridor-v0",
+    "anchor_mean",
+}  # of tests/example_package: tests/test_plugins.py
 COMMAND: Any = typer.main.get_command(app)
 
 

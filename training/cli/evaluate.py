@@ -39,6 +39,9 @@ def evaluate(
     seed: Seed = 0,
     settings: Settings = None,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw figures.")] = True,
+    report: Annotated[
+        bool, typer.Option("--report", help="Write report.html, too: see **coloc report**.")
+    ] = False,
     bound: Annotated[
         bool, typer.Option("--bound/--no-bound", help="Compute the posterior bound.")
     ] = True,
@@ -47,10 +50,10 @@ def evaluate(
 ) -> None:
     """Let agents meet the same worlds, and write how well each localizes.
 
-    The table is printed first. DIR receives results.json, results.csv, table.md, figures, and the
-    first run's trajectories as TUM files; results that are there already are replaced once
-    everything is done. If an agent ends in an error, or figures cannot be drawn, the rest is
-    written all the same, and the exit code is 1.
+    The table is printed first. DIR receives results.json, results.csv, table.md, figures, the first
+    run's trajectories as TUM files, and runs.safetensors, which reports are made of; results that
+    are there already are replaced once everything is done. If an agent ends in an error, or figures
+    cannot be drawn, the rest is written all the same, and the exit code is 1.
 
     **Examples**
 
@@ -77,6 +80,8 @@ def evaluate(
         with suppress(OSError, SystemExit):  # where nobody reads it, the files are still written
             _show(found)
         files.write(found, folder)
+        if report:
+            files.write_report(found, out.name, folder)
         if figures:
             drawn = _draw(found, folder)
     typer.echo(f"written to {out}")
@@ -86,10 +91,20 @@ def evaluate(
 
 def _show(found: "Evaluation") -> None:
     """Print the table, and what went wrong."""
-    from training.evaluation.tables import COLUMNS, left_out, rows
+    from training.evaluation.tables import (
+        COLUMNS,
+        INNOVATION_COLUMNS,
+        heading,
+        innovation_rows,
+        left_out,
+        rows,
+    )
 
     columns = {key: title for key, title in COLUMNS.items() if key not in _TOO_WIDE}
+    typer.echo(f"{heading(found)}; position errors in m")
     show(["", *columns.values()], rows(found, columns))
+    if found.innovations:
+        show(list(INNOVATION_COLUMNS), innovation_rows(found))
     if found.dropped:
         typer.echo(f"note: {left_out(found)}", err=True)
     for name, one in found.agents.items():

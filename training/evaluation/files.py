@@ -3,12 +3,15 @@
 import json
 from pathlib import Path
 
+from training.evaluation import runs
 from training.evaluation.results import Evaluation
 from training.evaluation.tables import csv_text, markdown
 from training.evaluation.tum import write_tum
 
 FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
-NAMES = ("results.csv", "table.md", *FIGURES, "tum", "results.json")
+REPORT = "report.html"
+WRITTEN = ("results.csv", "table.md", *FIGURES, "tum", runs.FILE, "results.json")
+NAMES = (REPORT, *WRITTEN)  # all that may be there; the last marks a whole folder
 
 
 def write(results: Evaluation, folder: Path) -> None:
@@ -18,6 +21,14 @@ def write(results: Evaluation, folder: Path) -> None:
     (folder / "results.csv").write_text(csv_text(results), encoding="utf-8")
     (folder / "table.md").write_text(markdown(results), encoding="utf-8")
     write_tum(results, folder / "tum")
+    runs.write(runs.of(results, ""), folder)
+
+
+def write_report(results: Evaluation, name: str, folder: Path) -> None:
+    """Write the page about the evaluation ``name``. ValueError where plotly is not installed."""
+    from training.evaluation.report.page import page
+
+    (folder / REPORT).write_text(page([runs.of(results, name)]), encoding="utf-8")
 
 
 def write_figures(results: Evaluation, folder: Path) -> None:

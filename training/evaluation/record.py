@@ -16,6 +16,7 @@ from torch import Tensor
 
 from agents.localizer import Localizer
 from coloc_env.scenario import Scenario
+from coloc_env.world import World
 from training.evaluation.metrics import Flags, Floats
 from training.evaluation.rollout import Breakdown, Step, rollout
 from training.evaluation.team import team_figures
@@ -30,15 +31,20 @@ class Worlds:
     """The worlds that were met, seeded ``seed`` … ``seed`` + R − 1, the same for every agent.
 
     ``truth`` [R, K, N, d]; ``attitude`` [K, N, a] of the first run (quaternion wxyz, body to world,
-    or heading in rad); ``scored`` [R, K, N]: where estimates count.
+    or heading in rad); ``scored`` [R, K, N]: where estimates count. ``links`` [K, N, N] of the
+    first run: whether a message of UAV j reaches UAV i; ``places`` of its landmarks and anchors
+    [M, d] (None and empty where they were not kept).
     """
 
     seed: int
     truth: Floats
     attitude: Floats
     scored: Flags
+    links: Flags | None = None
+    places: dict[str, Floats] = field(default_factory=dict)
 
     def to_arrays(self) -> Arrays:
+        """What tables and figures are made of."""
         return {"truth": self.truth, "attitude": self.attitude, "scored": self.scored}
 
     @classmethod
@@ -55,6 +61,8 @@ class Worlds:
             np.concatenate([part.truth for part in parts]),
             parts[0].attitude,
             np.concatenate([part.scored for part in parts]),
+            parts[0].links,
+            parts[0].places,
         )
 
 
@@ -66,7 +74,8 @@ class RunRecord:
     position, NaN where the covariance is not positive definite; ``broken`` [R]: runs with NaN,
     infinity or a numerical error; ``messages`` of such errors, one a run that raised one;
     ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
-    run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1, one thread.
+    run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1, one thread;
+    ``covariance`` [K, N, d, d] (m²) of the positions in the first run (None where it was not kept).
     """
 
     worlds: Worlds
@@ -77,6 +86,7 @@ class RunRecord:
     messages: tuple[str, ...] = ()
     series: dict[str, Floats] = field(default_factory=dict)
     ms_per_step: float | None = None
+    covariance: Floats | None = None
 
     def to_arrays(self) -> tuple[Arrays, Facts]:
         """The agent's own arrays, and facts that JSON can hold; the worlds are not among them."""
@@ -132,6 +142,7 @@ class RunRecord:
                 for name in dict.fromkeys(n for part in parts for n in part.series)
             },
             parts[0].ms_per_step,
+            parts[0].covariance,
         )
 
 
@@ -171,28 +182,51 @@ def _recorded(
     offset, error = torch.zeros(*shape, dim), torch.zeros(shape)
     consistency = torch.full(shape, torch.nan)
     scored, broken = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape[0], dtype=torch.bool)
+    covariance = torch.full((*shape[1:], dim, dim), torch.nan)
+    links = torch.zeros(*shape[1:], shape[2], dtype=torch.bool)
     series: dict[str, Tensor] = {}
     for step in rollout(localizer, scenario, seeds, stop=stop):
         k, world = step.k, step.world
+        links[k] = step.world.links[0]
         truth[:, k], attitude[k] = world.truth.position, world.truth.attitude[0]
         apart = step.action[..., :dim] - world.truth.position
         offset[:, k] = apart.to(torch.float32)
         error[:, k], scored[:, k] = world.score(step.action)
         broken |= (~step.finite & world.alive).any(-1)
         if step.estimate is not None:
+            covariance[k] = step.estimate.covariance[0]
             consistency[:, k] = nees(apart, step.estimate.covariance.double()).to(torch.float32)
             for name, value in _own_figures(localizer, step).items():
                 blank = torch.full(shape, torch.nan)
                 series.setdefault(name, blank)[:, k] = value.to(torch.float32)
         progress(len(seeds))
     return RunRecord(
-        Worlds(int(seeds[0]), truth.numpy(), attitude.numpy(), scored.numpy()),
+        Worlds(
+            int(seeds[0]),
+            truth.numpy(),
+            attitude.numpy(),
+            scored.numpy(),
+            links.numpy(),
+            places_of(step.world),
+        ),
         offset.numpy(),
         error.numpy(),
         consistency.numpy(),
         broken.numpy(),
         series={name: values.numpy() for name, values in series.items()},
+        covariance=covariance.numpy(),
     )
+
+
+def places_of(world: World) -> dict[str, Floats]:
+    """Positions [M, d] of landmarks and anchors in the first world, m."""
+    dim, static = world.scenario.arena.dim, world.static
+    maps = {"landmarks": "landmark_map", "anchors": "anchor_map"}
+    return {
+        name: static[leaf][0, 0].reshape(-1, dim).numpy()
+        for name, leaf in maps.items()
+        if leaf in static
+    }
 
 
 def _own_figures(localizer: Localizer, step: Step) -> dict[str, Tensor]:

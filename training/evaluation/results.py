@@ -11,6 +11,7 @@ import torch
 from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from training.evaluation import metrics
+from training.evaluation.innovations import disagreement
 from training.evaluation.metrics import Difference, Flags, Floats
 from training.evaluation.record import RunRecord, Worlds
 
@@ -36,7 +37,8 @@ METRICS = (
 class Evaluation:
     """All agents' runs in the same worlds, and the bound of those worlds (None: none is known).
 
-    ``errors``: of agents whose evaluation ended in an error, what it was.
+    ``errors``: of agents whose evaluation ended in an error, what it was. ``innovations``: of each
+    agent what can be said without truth, where there is none (``training.evaluation.innovations``).
     """
 
     scenario: Scenario
@@ -44,6 +46,7 @@ class Evaluation:
     bound: Bound | None
     agents: dict[str, RunRecord]
     errors: dict[str, str] = field(default_factory=dict)
+    innovations: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
     def seed(self) -> int:
@@ -87,6 +90,13 @@ class Evaluation:
         _, steps, n_uavs, dim = self.worlds.truth.shape
         return self.scenario.reference.errors(seeds, steps, n_uavs, dim, self.dt)
 
+    @cached_property
+    def disagreement(self) -> dict[str, float]:
+        """How far each agent is from the mean of the others, m; known where truth is not."""
+        if not self.innovations:
+            return {}
+        return disagreement({name: one.offset for name, one in self.agents.items()})
+
     def diverged(self, agent: str) -> Flags:
         """[R]: runs in which a UAV ends lost or an estimate was not finite."""
         one = self.agents[agent]
@@ -114,6 +124,12 @@ class Evaluation:
             "agents": {name: self._metrics(name) for name in self.agents}
             | {name: self._no_metrics(error) for name, error in self.errors.items()},
         }
+
+    def _repr_html_(self) -> str:
+        """The main table, in notebooks."""
+        from training.evaluation.tables import html_table
+
+        return html_table(self)
 
     def _metrics(self, agent: str) -> dict[str, Any]:
         one, scored = self.agents[agent], self.worlds.scored
@@ -177,6 +193,9 @@ class Evaluation:
             figures["nees_undefined_share"] = undefined
         if one.messages:
             figures["raised_runs"] = len(one.messages)
+        figures |= self.innovations.get(agent, {})
+        if agent in self.disagreement:
+            figures["disagreement"] = self.disagreement[agent]
         if self.dropped:
             figures["dropped_measurements"] = sum(self.dropped.values())
         return figures

@@ -1,6 +1,7 @@
 """Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -30,6 +31,17 @@ finite; it stays in every figure. NEES: {} is consistent, more is overconfident.
 team, one world, one thread."""
 
 
+WITHOUT_TRUTH = (
+    "Without ground truth: mean NIS of each sensor's measurements and where it lies for a "
+    "consistent filter, correlation of a link's successive innovations (0 if white), share beyond "
+    "the 99.9 % gate, predicted deviation per axis and distance from the other methods' mean (m)."
+)
+INNOVATION_COLUMNS = (
+    "agent", "sensor", "NIS", "band", "correlation", "band of it", "rejected", "predicted σ",
+    "disagreement",
+)  # fmt: skip
+
+
 def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     """The main table as text: one line for the bound, if known, and one per agent."""
     keys = tuple(keys)
@@ -42,12 +54,18 @@ def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     return lines
 
 
+def heading(results: Evaluation) -> str:
+    """Which worlds the table is about."""
+    runs = "1 run" if results.runs == 1 else f"{results.runs} runs"
+    what = f"{runs} of {results.scenario.horizon} steps of {results.dt:g} s"
+    last = results.seed + results.runs - 1
+    return f"{results.scenario.name}: {what}, seeds {results.seed} to {last}"
+
+
 def markdown(results: Evaluation) -> str:
     """The main table, paired differences to the first agent, and what the words mean."""
     names, dim = list(results.agents), results.scenario.arena.dim
-    what = f"{results.runs} runs of {results.scenario.horizon} steps of {results.dt:g} s"
-    last = results.seed + results.runs - 1
-    text = [f"# {results.scenario.name}: {what}, seeds {results.seed} to {last}", ""]
+    text = [f"# {heading(results)}", ""]
     if results.scenario.overrides:
         chosen = (f"`{key}={typed(value)}`" for key, value in results.scenario.overrides.items())
         text += ["Overrides: " + ", ".join(chosen) + ".", ""]
@@ -57,6 +75,8 @@ def markdown(results: Evaluation) -> str:
         differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
         text += table(["agent", "mean difference", "95 % interval"], differences)
+    if results.innovations:
+        text += ["", WITHOUT_TRUTH, "", *table(INNOVATION_COLUMNS, innovation_rows(results), 2)]
     for name, one in results.agents.items():
         if one.messages:
             how_many = f"{len(one.messages)} of {results.runs} runs"
@@ -66,6 +86,33 @@ def markdown(results: Evaluation) -> str:
     if results.dropped:
         text += ["", left_out(results)]
     return "\n".join(text) + "\n"
+
+
+def innovation_rows(results: Evaluation) -> list[list[str]]:
+    """What is known of each agent without truth: a line a sensor."""
+    lines = []
+    for name, found in results.innovations.items():
+        figures = plain(found | {"apart": results.disagreement.get(name)})
+        ends = (short(figures.get("predicted_std")), short(figures["apart"]))
+        sensors = [key.removeprefix("nis_") for key in found if f"{key}_low" in found]
+        for sensor in sensors or [""]:
+            own = {key: figures.get(f"{key}_{sensor}") for key in ("nis", "whiteness", "rejected")}
+            band = [short(figures.get(f"nis_{sensor}_{end}")) for end in ("low", "high")]
+            band = band if sensor else ["–"]
+            white = short(figures.get(f"whiteness_{sensor}_band"))
+            shown = (short(own["nis"]), " to ".join(band), short(own["whiteness"]), f"± {white}")
+            lines.append([name, sensor or "–", *shown, short(own["rejected"]), *ends])
+    return lines
+
+
+def html_table(results: Evaluation) -> str:
+    """The main table as notebooks show it."""
+    lines = [["", *COLUMNS.values()], *rows(results)]
+    cells = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in line)
+        for line, tag in zip(lines, ["th", *["td"] * (len(lines) - 1)], strict=True)
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in cells) + "</table>"
 
 
 def left_out(results: Evaluation) -> str:

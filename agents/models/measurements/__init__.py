@@ -3,7 +3,14 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, no_neighbours, received
+from agents.models.measurements.base import (
+    Block,
+    Measurement,
+    Neighbours,
+    no_neighbours,
+    noise_std,
+    received,
+)
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
@@ -25,6 +32,7 @@ from coloc_env.sensors import (
     SlowFlight,
     UavBearings,
 )
+from coloc_env.sensors.base import usable
 
 __all__ = [
     "MODELS",
@@ -43,7 +51,9 @@ __all__ = [
     "measures",
     "model_of",
     "no_neighbours",
+    "noise_std",
     "received",
+    "usable",
 ]
 
 _M = TypeVar("_M", bound=Callable[[Any], Measurement])

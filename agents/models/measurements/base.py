@@ -14,7 +14,6 @@ from agents.models.process import Process
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-_FARTHEST = 1e4  # m: of distances that a sensor can measure
 _LEAST_STD = 1e-3  # m, rad
 
 
@@ -92,18 +91,6 @@ class Block:
         along = ((u.unsqueeze(-2) @ m) * u.unsqueeze(-2)).sum((-2, -1))
         lateral = m.diagonal(dim1=-2, dim2=-1).sum(-1) - along
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
-
-
-def usable(
-    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
-) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
-    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
-    ``ranges``, the first is no distance that a sensor can give. Every measurement model reads its
-    leaves through this."""
-    mask = mask & z.isfinite().all(-1)
-    if ranges:
-        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
-    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
 
 
 def noise_std(std: float) -> float:

@@ -9,12 +9,12 @@ from agents.models.measurements.base import (
     Measurement,
     Neighbours,
     noise_std,
-    usable,
 )
 from agents.models.process import Process
 from coloc_env.geometry import wrap_angle
 from coloc_env.observation import Observation
 from coloc_env.sensors import LandmarkBearings, UavBearings
+from coloc_env.sensors.base import usable
 
 
 def _range_bearing(

@@ -12,12 +12,12 @@ from agents.models.measurements.base import (
     Measurement,
     Neighbours,
     noise_std,
-    usable,
 )
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import Height, Landmarks, PositionFix, SlowFlight
+from coloc_env.sensors.base import usable
 
 
 class LandmarkVectors(Measurement):

@@ -5,100 +5,29 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from jaxtyping import Float, Float64
+from coloc_example.beacon import Beacon, BeaconVectors, beacon_room
 from torch import Tensor
 
 from agents import make
-from agents.models.measurements import MODELS, Block, Measurement, Neighbours, measures
-from agents.models.process import Process
-from coloc_env import noise
-from coloc_env.bounds.information import own_information
+from agents.models.measurements import no_neighbours
+from agents.models.process import make_process
 from coloc_env.bounds.posterior import posterior_bound
 from coloc_env.geometry import rotation_matrix
-from coloc_env.motion import Kinematics
-from coloc_env.observation import Observation
-from coloc_env.options import Metres
-from coloc_env.scenario import Scenario, TeamOptions
+from coloc_env.scenario import Scenario
 from coloc_env.scenarios import SCENARIOS, make_scenario
-from coloc_env.sensors import Layout, Leaf, Sensor, Window
+from coloc_env.sensors import Layout, Leaf, Window
 from coloc_env.world import World
 
-STEPS, WORLDS, STD = 60, 40, 0.3
-
-
-@dataclass(frozen=True)
-class Beacon(Sensor):
-    """Leaf ``beacon`` [d]: where the arena's centre is, seen from the UAV, in its body frame (m),
-    with Gaussian noise ``std`` per axis."""
-
-    std: float = STD
-
-    def leaves(self, layout: Layout) -> dict[str, Leaf]:
-        return {"beacon": Leaf(layout.arena.dim)}
-
-    def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
-        motion = window.motion
-        apart = motion.position.new_tensor(window.layout.arena.centre) - motion.position
-        seen = (apart.unsqueeze(-2) @ rotation_matrix(motion.attitude)).squeeze(-2).float()
-        white = noise.normal(window.keys, "beacon", seen[0, 0].numel()).view(seen.shape)
-        return {"beacon": (seen + self.std * white) * window.alive.unsqueeze(-1)}
-
-
-class BeaconVectors(Measurement):
-    """z = Rᵀ(c − p) + noise, with the attitude taken as known."""
-
-    def __init__(self, sensor: Beacon) -> None:
-        self.variance, self.centre = sensor.std**2, CENTRE
-
-    def linearize(
-        self,
-        process: Process,
-        x: Float[Tensor, "B N S"],
-        observation: Observation,
-        neighbours: Neighbours,
-        derivatives: bool = True,
-    ) -> Block:
-        rotation, d = process.rotation(x), process.dim
-        assert rotation is not None
-        z = observation["beacon"].to(x.dtype)
-        expected = ((x.new_tensor(self.centre) - x[..., :d]).unsqueeze(-2) @ rotation).squeeze(-2)
-        residual = (z - expected).unsqueeze(-2)
-        jacobian = x.new_zeros(*residual.shape, process.error_size)
-        jacobian[..., 0, :, :d] = -rotation.mT
-        return Block(
-            residual=residual,
-            jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
-            mask=torch.ones(residual.shape[:-1], dtype=torch.bool),
-        )
-
-
+STEPS, WORLDS, STD, STEP = 60, 40, 0.3, 1e-6
 CENTRE = (15.0, 10.0, 2.5)
-
-
-def beacon_room(*, beacon_std: Metres = STD, team: TeamOptions = TeamOptions()) -> Scenario:  # noqa: B008
-    """A room in which UAVs see a beacon and nothing else."""
-    plain = make_scenario("indoor-v0", n_uavs=team.n_uavs, landmarks=0, uwb=False)
-    beacon = Beacon(beacon_std)
-    own = (*plain.sensors, beacon)
-    return replace(plain, name="beacon-v0", sensors=own, believed_sensors=own)
 
 
 @pytest.fixture(autouse=True)
 def beacons() -> Iterator[None]:
-    """All that a package of one's own does when it is imported."""
-    measures(Beacon)(BeaconVectors)
-
-    @own_information.register
-    def _(sensor: Beacon, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
-        information = truth.position.new_zeros(*truth.position.shape[:2], 6, 6)
-        information[..., :3, :3] = torch.eye(3, dtype=torch.float64) / sensor.std**2
-        return information
-
+    """What the package's entry point does; its module registered the model and the information."""
     SCENARIOS.register("beacon-v0")(beacon_room)
     yield
     SCENARIOS.remove("beacon-v0")
-    del MODELS[Beacon]
 
 
 def rmse(agent: str, scenario: Scenario) -> float:
@@ -121,6 +50,23 @@ def test_the_leaf_is_what_the_sensor_measures() -> None:
     exact = apart.unsqueeze(-2) @ rotation_matrix(world.truth.attitude)
     error = (seen - exact.squeeze(-2)).flatten()
     assert float(error.std()) == pytest.approx(STD, rel=4 / (2 * len(error)) ** 0.5)
+
+
+def test_its_jacobian_is_that_of_finite_differences() -> None:
+    scenario = make_scenario("beacon-v0", n_uavs=2)
+    process, model = make_process(scenario.believed), BeaconVectors(Beacon(CENTRE))
+    observation = World(scenario, 3).reset(torch.arange(3))
+    x = process.initial(observation["prior"].double())[0]
+    x = process.boxplus(x, 0.3 * torch.randn(*x.shape[:2], process.error_size, dtype=x.dtype))
+    none = no_neighbours(x[..., :3])
+    jacobian = model.linearize(process, x, observation, none).jacobian
+    for i, axis in enumerate(torch.eye(process.error_size, dtype=x.dtype)):
+        ahead, behind = (
+            model.linearize(process, process.boxplus(x, step * axis), observation, none, False)
+            for step in (STEP, -STEP)
+        )
+        numeric = (behind.residual - ahead.residual) / (2 * STEP)  # of h = z − residual
+        torch.testing.assert_close(jacobian[..., i], numeric, atol=1e-6, rtol=1e-6)
 
 
 def test_its_information_sharpens_the_bound() -> None:
@@ -147,7 +93,7 @@ def test_what_extends_a_sensor_has_its_model() -> None:
         pass
 
     plain = make_scenario("beacon-v0", n_uavs=2)
-    lit = (*plain.sensors[:1], Lamp())
+    lit = (*plain.sensors[:1], Lamp(CENTRE))
     other = replace(plain, sensors=lit, believed_sensors=lit)
     assert rmse("ekf", other) == rmse("ekf", plain)
     assert posterior_bound(other, 2, steps=5).rmse == posterior_bound(plain, 2, steps=5).rmse
@@ -167,7 +113,7 @@ def test_a_sensor_between_uavs_counts_for_the_team_alone() -> None:
             return {"whistle": super().sample(window, placed)["beacon"]}
 
     plain = make_scenario("beacon-v0", n_uavs=2)
-    other = replace(plain, sensors=(*plain.sensors, Whistle()))
+    other = replace(plain, sensors=(*plain.sensors, Whistle(CENTRE)))
     alone = posterior_bound(other, 2, steps=5, cooperative=False)
     assert torch.equal(alone.mse, posterior_bound(plain, 2, steps=5, cooperative=False).mse)
     with pytest.raises(NotImplementedError, match="no Fisher information is known for Whistle"):

@@ -1,1 +1,1 @@
-"""An example package: a scenario, a localizer and a training of one's own."""
+"""An example package: a sensor, scenarios, a localizer and a training of one's own."""
