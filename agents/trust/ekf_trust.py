@@ -14,12 +14,12 @@ from coloc_env.scenario import Believed
 class TrustingEkf(CooperativeEkf):
     """Cooperative EKF with learned trust in every landmark, bearing and range.
 
-    Huber iterations (three more where the prior is broad), then one with the weights and range biases
-    that the networks give to what they see, where those are no larger than Huber's. A UAV speaks
-    with this branch while it predicts better than one with Huber's weights alone; ``bank=false``
-    is the networks' alone, without Huber's cap. ``weights``: a checkpoint's name or path, ``none``,
-    or ``auto``, which is ``trust_bank``, or without a bank ``trust``. ``iterations``: none: two in
-    a bank, as ``ekf`` has them, three without.
+    Huber iterations (three more where the prior is broad), then one with the weights and range
+    biases that the networks give to what they see, where those are no larger than Huber's. A UAV
+    speaks with this branch while it predicts no worse than one with Huber's weights alone;
+    ``bank=false`` is the networks' alone, without Huber's cap. ``weights``: a checkpoint's name or
+    path, ``none``, or ``auto``: ``trust_bank``, without a bank ``trust``. ``iterations``: none: two
+    in a bank, as ``ekf`` has them, three without.
     """
 
     name = "ekf_trust"
