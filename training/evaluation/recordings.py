@@ -19,7 +19,7 @@ from training.evaluation.tables import short
 
 AGENTS = (
     *("ekf", "ekf:robust=huber", "ekf_trust:bank=false", "ekf_trust"),
-    *("map", "hpff:main=pf@particles=1000", "nnhpff:main=pf@particles=1000"),
+    *("map", "hpff:main=ekf", "nnhpff:main=ekf"),
 )
 CLASSICAL = AGENTS[:2]
 _DASH = "–"
