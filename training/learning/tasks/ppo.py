@@ -22,7 +22,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.trainers import ReplayBufferTrainer
 
-from agents.policies.decisions import outputs_of, relations_width, require_decisions
+from agents.policies.decisions import actor_for
 from agents.policies.moves import MOVES, table
 from agents.policies.task_actor import NETWORKS, TaskActor
 from agents.tasks import make_task
@@ -164,21 +164,16 @@ def _ppo(
     score_worlds: ScoreWorlds = 256,
 ) -> Training:
     made = make_task(task)
-    require_decisions(made, network, moves, hold)
-    outputs, discrete = outputs_of(made, moves)
-    with drawn_from(seed):
-        actor = TaskActor(
-            task,
-            made.leaves["observation"].width,
-            outputs,
-            discrete,
-            network,
-            hidden,
-            moves,
-            hold,
-            relations_width(made, network),
-            sampled=draw or made.sampled,
-        )
+    actor = actor_for(
+        task,
+        made,
+        seed,
+        network=network,
+        moves=moves,
+        hold=hold,
+        hidden=hidden,
+        sampled=draw or made.sampled,
+    )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
