@@ -17,6 +17,8 @@ _TRUTH_WITHIN = 50_000_000  # ns: a step is scored if truth was sampled this clo
 _TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
 _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
+_PHASES = 32  # of a step, tried
+_LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
@@ -39,8 +41,9 @@ class Grid:
 
 
 def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Grid:
-    """Steps over the longest span in which all robots have truth and every driving stream."""
-    spans = [(t.time[0], t.time[-1]) for t in recording.truth]
+    """Steps over the longest span in which all robots that have truth have it, and every driving
+    stream; without any of either, from the first sample of a stream to the last."""
+    spans = [(t.time[0], t.time[-1]) for t in recording.truth if len(t.time)]
     for name in drivers:
         tables = recording.streams.get(name, ())
         if not tables or not all(len(table.time) for table in tables):
@@ -48,11 +51,57 @@ def common_grid(recording: Recording, dt: float, drivers: tuple[str, ...]) -> Gr
         spans += [(table.time[0], table.time[-1]) for table in tables]
     if not _LEAST_DT <= dt < np.inf:
         raise ValueError(f"dt={dt} is not allowed: a time in s from {_LEAST_DT}")
+    if not spans:
+        every = [t.time for team in recording.streams.values() for t in team if len(t.time)]
+        if not every:
+            raise DataError(f"{recording.name} has neither truth nor measurements")
+        spans = [(min(time[0] for time in every), max(time[-1] for time in every))]
     start, end = max(s for s, _ in spans), min(e for _, e in spans)
     count = int((end - start) // round(dt * 1e9)) + 1
     if count < 2:
         raise DataError(f"{recording.name}: its streams overlap for less than one step of {dt} s")
     return Grid(int(start), dt, count)
+
+
+def aligned(grid: Grid, recording: Recording, streams: tuple[str, ...]) -> Grid:
+    """The grid shifted by less than a step: so that no step delivers a pair's range twice, if that
+    can be, and then so that what some streams measure is as fresh as can be when it is delivered.
+    """
+    tables = [table for name in streams for table in recording.streams[name] if len(table.time)]
+    if not tables or grid.count < 3:
+        return grid
+    period = round(grid.dt * 1e9)
+    time = np.concatenate([table.time for table in tables])
+    pairs = [_links(recording, name) for name in streams if name in _LINKS]
+    best, least = 0, (len(time), np.inf)
+    for offset in (i * period // _PHASES for i in range(_PHASES)):
+        late = time - grid.start - offset
+        age = float((-late % period).mean())
+        twice = sum(_repeats(_delivered(grid, offset, each), link) for each, link in pairs)
+        if (twice, age) < least:
+            best, least = offset, (twice, age)
+    return Grid(grid.start + best, grid.dt, grid.count - (best > 0))
+
+
+def _delivered(grid: Grid, offset: int, time: Stamps) -> NDArray[np.int64]:
+    """The steps that deliver measurements of some times on the grid shifted by ``offset`` ns."""
+    return -((grid.start + offset - time) // round(grid.dt * 1e9))
+
+
+def _links(recording: Recording, stream: str) -> tuple[Stamps, NDArray[np.int64]]:
+    """Times and links of all measurements of a stream: two of one link must not share a step."""
+    tables = recording.streams[stream]
+    ends = [table.values[:, : _LINKS[stream]].astype(np.int64) for table in tables]
+    owner = np.repeat(np.arange(len(tables)), [len(each) for each in ends])
+    whole = np.column_stack((owner, np.concatenate(ends)))
+    link = np.unique(whole, axis=0, return_inverse=True)[1].reshape(-1)
+    return np.concatenate([table.time for table in tables]), link
+
+
+def _repeats(step: NDArray[np.int64], link: NDArray[np.int64]) -> int:
+    """How many measurements share their step and link with one before."""
+    key = step * (int(link.max(initial=0)) + 1) + link
+    return len(key) - len(np.unique(key))
 
 
 def truth_on(grid: Grid, track: Track) -> tuple[Floats, Floats, Floats, Flags]:
@@ -147,10 +196,13 @@ def odometry_on(grid: Grid, table: Table) -> Floats:
     moved, heading = np.zeros((grid.count, 2)), np.zeros(grid.count)
     for slot in range(samples.shape[1]):
         h = durations[:, slot]
-        speed, turn = samples[:, slot, 0] * h, samples[:, slot, 1] * h
+        speed, turn = samples[:, slot, 0] * h, samples[:, slot, -1] * h
         middle = heading + 0.5 * turn
         chord = speed * np.sinc(0.5 * turn / np.pi)
         moved += np.stack((np.cos(middle), np.sin(middle)), 1) * chord[:, None]
+        if samples.shape[2] == 3:  # sideways, too
+            chord = samples[:, slot, 1] * h * np.sinc(0.5 * turn / np.pi)
+            moved += np.stack((-np.sin(middle), np.cos(middle)), 1) * chord[:, None]
         heading += turn
     return np.concatenate((moved, heading[:, None]), 1) / grid.dt
 

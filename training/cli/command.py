@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.recording import recording
 from training.cli.recordings import recordings
 from training.cli.render import render
 from training.cli.report import report
@@ -77,6 +78,7 @@ for _command in (
     reproduce,
 ):
     app.command()(_command)
+app.add_typer(recording, name="recording")
 
 
 def _print_version(wanted: bool) -> None:

@@ -32,6 +32,17 @@ finite; it stays in every figure. NEES: {} is consistent, more is overconfident.
 each UAV sends to others in a step. ms/step: the whole team, one world, one thread."""
 
 
+WITHOUT_TRUTH = (
+    "Without ground truth: mean NIS of each sensor's measurements and where it lies for a "
+    "consistent filter, correlation of a link's successive innovations (0 if white), share beyond "
+    "the 99.9 % gate, predicted deviation per axis and distance from the other methods' mean (m)."
+)
+INNOVATION_COLUMNS = (
+    "agent", "sensor", "NIS", "band", "correlation", "band of it", "rejected", "predicted σ",
+    "disagreement",
+)  # fmt: skip
+
+
 def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
     """The main table as text: one line for the bound, if known, and one per agent."""
     keys = tuple(keys)
@@ -65,6 +76,8 @@ def markdown(results: Evaluation) -> str:
         differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
         text += table(["agent", "mean difference", "95 % interval"], differences)
+    if results.innovations:
+        text += ["", WITHOUT_TRUTH, "", *table(INNOVATION_COLUMNS, innovation_rows(results), 2)]
     for name, one in results.agents.items():
         if one.messages:
             how_many = f"{len(one.messages)} of {results.runs} runs"
@@ -74,6 +87,23 @@ def markdown(results: Evaluation) -> str:
     if results.dropped:
         text += ["", left_out(results)]
     return "\n".join(text) + "\n"
+
+
+def innovation_rows(results: Evaluation) -> list[list[str]]:
+    """What is known of each agent without truth: a line a sensor."""
+    lines = []
+    for name, found in results.innovations.items():
+        figures = plain(found | {"apart": results.disagreement.get(name)})
+        ends = (short(figures.get("predicted_std")), short(figures["apart"]))
+        sensors = [key.removeprefix("nis_") for key in found if f"{key}_low" in found]
+        for sensor in sensors or [""]:
+            own = {key: figures.get(f"{key}_{sensor}") for key in ("nis", "whiteness", "rejected")}
+            band = [short(figures.get(f"nis_{sensor}_{end}")) for end in ("low", "high")]
+            band = band if sensor else ["–"]
+            white = short(figures.get(f"whiteness_{sensor}_band"))
+            shown = (short(own["nis"]), " to ".join(band), short(own["whiteness"]), f"± {white}")
+            lines.append([name, sensor or "–", *shown, short(own["rejected"]), *ends])
+    return lines
 
 
 def html_table(results: Evaluation) -> str:

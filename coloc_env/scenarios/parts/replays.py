@@ -16,21 +16,12 @@ from coloc_env.sensors import RangeNoise
 
 
 @dataclass(frozen=True)
-class RecordingOptions(Group):
-    """``sequence``: which recording (none: the one with the most robots); ``data``: the folder that
-    holds the data sets (none: that of the environment variable COLOC_DATA); ``span``: the part that
-    is replayed, from and to, in s after the start (none: all of it)."""
+class SpanOptions(Group):
+    """``span``: the part that is replayed, from and to, in s after the start (none: all of it)."""
 
     title: ClassVar[str] = "recording"
 
-    sequence: str | None = None
-    data: str | None = None
     span: tuple[Seconds, Seconds] | None = None
-
-    def load(self, dataset: str, **options: Any) -> Recording:
-        """The recording of a data set."""
-        known = version(dataset_folder(dataset, self.data))
-        return _loaded(known, dataset, self.sequence, self.data, **options)
 
     def cut(self, grid: Grid) -> Grid:
         """The steps of ``span``, of the steps of a whole recording."""
@@ -43,6 +34,27 @@ class RecordingOptions(Group):
                 f"{grid.count * grid.dt:.1f}"
             )
         return Grid(int(grid.times[first]), grid.dt, last - first + 1)
+
+
+@dataclass(frozen=True)
+class OwnReplayOptions(SpanOptions):
+    """``dt``: duration of a step."""
+
+    dt: PositiveSeconds = 0.1
+
+
+@dataclass(frozen=True)
+class RecordingOptions(SpanOptions):
+    """``sequence``: which recording (none: the one with the most robots); ``data``: the folder that
+    holds the data sets (none: that of the environment variable COLOC_DATA)."""
+
+    sequence: str | None = None
+    data: str | None = None
+
+    def load(self, dataset: str, **options: Any) -> Recording:
+        """The recording of a data set."""
+        known = version(dataset_folder(dataset, self.data))
+        return _loaded(known, dataset, self.sequence, self.data, **options)
 
 
 @dataclass(frozen=True)

@@ -220,14 +220,15 @@ def _ppo(
             group["lr"] = learning_rate * left
         if entropy > 0:
             loss.entropy_coeff.fill_(last_entropy + (entropy - last_entropy) * left)
-        reader.carried = None
-        return Collector(
+        collecting = Collector(
             worlds_of(epoch),
             player,
             frames_per_batch=worlds * decisions,
             total_frames=worlds * decisions,
             auto_register_policy_transforms=False,
         )
+        reader.carried = None  # the Collector has tried the policy once
+        return collecting
 
     collector = EpochCollector(collect, epochs)
     whole = network == "recurrent"  # episodes are kept whole, in order

@@ -1,0 +1,224 @@
+"""``replay-v0``: a recording of one's own, in the open format."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from coloc_env.datasets import Recording
+from coloc_env.datasets.folders import Version, expanded, version
+from coloc_env.datasets.grid import Grid, aligned, common_grid
+from coloc_env.datasets.noise_model import NoiseModel, corrected, read_noise_model
+from coloc_env.datasets.open_format import FILE, read_recording
+from coloc_env.datasets.recording import DataError
+from coloc_env.datasets.replay import (
+    arena_of,
+    lever_arms,
+    recorded_anchor_ranges,
+    recorded_bearings,
+    recorded_fixes,
+    recorded_height,
+    recorded_imu,
+    recorded_landmarks,
+    recorded_motion,
+    recorded_odometry,
+    recorded_ranges,
+)
+from coloc_env.datasets.starts import level, spread_of_start
+from coloc_env.network import Network
+from coloc_env.scenario import (
+    ConstantVelocity,
+    Inertial,
+    Prior,
+    PriorOptions,
+    Process,
+    Reward,
+    Scenario,
+    Wheeled,
+)
+from coloc_env.scenarios.parts.replays import OwnReplayOptions
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Imu,
+    LandmarkBearings,
+    Landmarks,
+    Odometry,
+    PositionFix,
+    RangeNoise,
+    Ranging,
+    RecordedSensor,
+    Sensor,
+    SlowFlight,
+    UavBearings,
+)
+
+Pair = tuple[Sensor, Sensor]
+_HELD, _USUAL = 1.0, 10.0  # s, usual intervals: for the longer a sample of odometry stands
+_UNKNOWN = np.pi / 3**0.5  # rad: standard deviation of an attitude of which nothing is known
+
+
+def replay_own(
+    *,
+    path: str | None = None,
+    believed: str | None = None,
+    process: Literal["auto", "inertial", "wheeled", "constant_velocity"] = "auto",
+    reward: Reward = "error",
+    replay: OwnReplayOptions = OwnReplayOptions(),
+    prior: PriorOptions = PriorOptions(prior_std=0.5),
+) -> Scenario:
+    """A recording of one's own: the folder ``path`` in the open format. Nothing is simulated but
+    the prior's draw.
+
+    ``believed``: the file with what the team believes of its sensors, as ``coloc recording
+    calibrate`` writes it (none: the recording's own, or defaults). ``process=auto``: inertial with
+    an IMU in space, wheeled with odometry in the plane, else a constant velocity.
+
+    Without ground truth everything runs all the same: the reward is 0 and nothing is scored but at
+    marked points. The prior is then about the recording's ``start``, or, where that is not given,
+    uniform over an arena around the map.
+    """
+    if path is None:
+        raise ValueError("path=none is not allowed: the folder of a recording is needed")
+    folder = expanded(path)
+    recording = _read(version(folder), folder)
+    model = _believed(recording, folder, believed)
+    recording = corrected(recording, model)
+    kind = _kind(recording, model.motion.model if process == "auto" else process)
+    driver = {"inertial": ("imu",), "wheeled": ("odometry",)}.get(kind, ())
+    whole = common_grid(recording, replay.dt, driver)
+    pairs, used = _sensors(recording, model)
+    grid = replay.cut(aligned(whole, recording, tuple(used)))
+    sensors = [make(grid) for make in pairs]
+    settings: Process = ConstantVelocity(model.motion.accel_std, model.motion.damping or None)
+    if kind == "inertial":
+        imu = model.imu
+        own, no_bias = Imu(imu.accel_std, imu.gyro_std), np.zeros((len(recording.robots), 6))
+        sensors.append((recorded_imu(recording, grid, own, no_bias), own))
+        settings = Inertial(imu.accel_bias, imu.gyro_bias, imu.accel_walk, imu.gyro_walk)
+    elif kind == "wheeled":
+        wheels = model.odometry
+        read = Odometry(wheels.forward_std, wheels.left_std, wheels.turn_std, wheels.relative)
+        sensors.append((_odometry(recording, grid, read, model), read))
+        settings = Wheeled()
+    beliefs = [belief for _, belief in sensors]
+    if model.motion.slow_flight and kind != "wheeled":
+        beliefs.append(SlowFlight(model.motion.slow_flight))
+    _name_unused(recording, {*used, *driver})
+    recording = level(recording, grid)
+    return Scenario(
+        name="replay-v0",
+        arena=arena_of(recording, grid, margin=1.0),
+        horizon=grid.count - 1,
+        motion=recorded_motion(recording, grid),
+        sensors=tuple(sensor for sensor, _ in sensors),
+        network=Network(),
+        prior=_prior(recording, prior),
+        process=settings,
+        believed_sensors=tuple(beliefs),
+        reward=reward,
+    )
+
+
+def _believed(recording: Recording, folder: Path, believed: str | None) -> NoiseModel:
+    if believed is not None:
+        return read_noise_model(expanded(believed), recording)
+    return read_noise_model(folder / FILE, recording, "believed")
+
+
+def _kind(recording: Recording, wanted: str) -> str:
+    """The motion model: as asked for, or by what drives there are."""
+    streams, dim = recording.streams, recording.dim
+
+    def whole(stream: str) -> bool:
+        return stream in streams and all(len(table.time) for table in streams[stream])
+
+    if wanted == "auto":
+        if dim == 3 and whole("imu"):
+            return "inertial"
+        return "wheeled" if dim == 2 and whole("odometry") else "constant_velocity"
+    for kind, stream, needed in (("inertial", "imu", 3), ("wheeled", "odometry", 2)):
+        if wanted == kind and (dim != needed or not whole(stream)):
+            raise DataError(
+                f"{recording.name}: process={kind} needs {stream} of every robot in {needed} "
+                "dimensions; process=constant_velocity does without"
+            )
+    return wanted
+
+
+def _sensors(
+    recording: Recording, model: NoiseModel
+) -> tuple[list[Callable[[Grid], Pair]], list[str]]:
+    """What makes, on a grid, each sensor that corrects an estimate and the belief about it; and the
+    streams that they are of."""
+    makers: dict[str, Callable[[Grid], Pair]] = {}
+    tags = lever_arms(recording) if recording.tags.shape[1] else ()
+    if "anchor_ranges" in recording.streams:
+        places = tuple(map(tuple, recording.anchors.tolist()))
+        anchors = AnchorRanging(places, RangeNoise(std=model.anchor_ranges.std), tags)
+        makers["anchor_ranges"] = lambda g: (recorded_anchor_ranges(recording, g, anchors), anchors)
+    if "uav_ranges" in recording.streams:
+        ranging = Ranging(RangeNoise(std=model.uav_ranges.std), tags)
+        makers["uav_ranges"] = lambda g: (recorded_ranges(recording, g, ranging), ranging)
+    if "landmark_bearings" in recording.streams:
+        own = model.landmark_bearings
+        seen = LandmarkBearings(len(recording.landmarks), own.range_std, own.bearing_std)
+        makers["landmark_bearings"] = lambda g: _bearings(recording, g, seen)
+    if "uav_bearings" in recording.streams:
+        met = UavBearings(model.uav_bearings.range_std, model.uav_bearings.bearing_std)
+        makers["uav_bearings"] = lambda g: _bearings(recording, g, met)
+    if "landmark_vectors" in recording.streams:
+        count, std = len(recording.landmarks), model.landmark_vectors.std
+        places = tuple(map(tuple, recording.landmarks.tolist()))
+        vectors = Landmarks(count, std, radius=1e4, positions=places)
+        makers["landmark_vectors"] = lambda g: (recorded_landmarks(recording, g, vectors), vectors)
+    if "height" in recording.streams:
+        height = Height(model.height.std)
+        makers["height"] = lambda g: (recorded_height(recording, g, height), height)
+    if "position_fix" in recording.streams:
+        fix = PositionFix(model.position_fix.std, len(recording.robots))
+        makers["position_fix"] = lambda g: (recorded_fixes(recording, g, fix), fix)
+    return list(makers.values()), list(makers)
+
+
+def _bearings(recording: Recording, grid: Grid, sensor: LandmarkBearings | UavBearings) -> Pair:
+    found, depth = recorded_bearings(recording, grid, sensor)
+    sensor = replace(sensor, depth=depth)
+    return replace(found, sensor=sensor), sensor
+
+
+def _odometry(
+    recording: Recording, grid: Grid, sensor: Odometry, model: NoiseModel
+) -> RecordedSensor:
+    wheels = model.odometry
+    tables = recording.streams["odometry"]
+    usual = max(float(np.median(np.diff(table.time))) * 1e-9 for table in tables)
+    held = max(_HELD, _USUAL * usual)
+    corrections = (wheels.delay, wheels.scale, wheels.turn_scale)
+    return recorded_odometry(recording, grid, sensor, held, *corrections)
+
+
+def _prior(recording: Recording, prior: PriorOptions) -> Prior:
+    """As the options say where the start is known; else uniform, and of no known attitude."""
+    place, attitude = spread_of_start(recording)
+    if not place and prior.prior == "gaussian":
+        prior = replace(prior, prior="uniform")
+    return prior.at_start(0.2, 0.1 if attitude else _UNKNOWN)
+
+
+def _name_unused(recording: Recording, used: set[str]) -> None:
+    """Say which streams nobody will look at."""
+    unused = [name for name in recording.streams if name not in used]
+    if unused:
+        what = ", ".join(unused)
+        warnings.warn(f"{recording.name}: this motion model does not use {what}", stacklevel=4)
+
+
+@lru_cache(maxsize=4)
+def _read(known: Version, folder: Path) -> Recording:
+    """A recording, kept for the next scenario that replays it until one of its files changes."""
+    return read_recording(folder)
