@@ -6,6 +6,7 @@ interval exactly, each sample held until the next, but no longer than it may sta
 0.1 s): beyond that the stream's mean does, and how wrong that may be is given with it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,10 +148,25 @@ def held_intervals(grid: Grid, table: Table) -> tuple[Floats, Floats]:
     return samples, durations
 
 
-def bridged(table: Table, held: float) -> tuple[Table, Table]:
+@dataclass(frozen=True)
+class Usual:
+    """What the samples of a stream are like: mean and variance [F], median interval in s."""
+
+    mean: Floats
+    variance: Floats
+    interval: float
+
+
+def usual(table: Table) -> Usual:
+    """What all samples of a stream are like."""
+    interval = float(np.median(np.diff(table.time))) * 1e-9 if len(table.time) > 1 else 0.0
+    return Usual(table.values.mean(0), table.values.var(0), interval)
+
+
+def bridged(table: Table, held: float, mean: Floats) -> tuple[Table, Table]:
     """Samples that stand for ``held`` s at most, and their mean from then on until the next; and 1
     where the mean stands and 0 elsewhere, in the same form."""
-    mean, most = table.values.mean(0), round(held * 1e9)
+    most = round(held * 1e9)
     ends = np.flatnonzero(np.diff(table.time) > most)
     time = np.insert(table.time, ends + 1, table.time[ends] + most)
     values = np.insert(table.values, ends + 1, mean, 0)
@@ -170,15 +186,21 @@ def unknown_on(grid: Grid, missing: Table, spread: Floats) -> Floats:
     return share[:, None] * spread * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
 
 
-def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:
-    """``imu`` leaf [T, 6]: increments of velocity and attitude over each step, divided by dt, in
-    the body frame at the step's start (pre-integration; Forster et al. 2017, eqs. 33-36).
+def imu_on(grid: Grid, tables: Sequence[Table], gyro_bias: Floats) -> Floats:
+    """``imu`` leaf [T, N, 6] of N robots: increments of velocity and attitude over each step,
+    divided by dt, in the body frame at the step's start (pre-integration; Forster et al. 2017,
+    eqs. 33-36).
 
-    ``gyro_bias`` (rad/s) is taken off first, so that the rotation within a step is right.
+    ``gyro_bias`` (rad/s, [N, 3]) is taken off first, so that the rotation within a step is right.
     """
-    samples, durations = held_intervals(grid, table)
-    turn = np.tile((1.0, 0.0, 0.0, 0.0), (grid.count, 1))
-    gained = np.zeros((grid.count, 3))
+    held = [held_intervals(grid, table) for table in tables]
+    width = max(durations.shape[1] for _, durations in held)
+    samples, durations = (
+        np.concatenate([_widened(each, width) for each in parts]) for parts in zip(*held, strict=True)
+    )  # robot by robot
+    gyro_bias = np.repeat(gyro_bias, grid.count, 0)
+    turn = np.tile((1.0, 0.0, 0.0, 0.0), (len(samples), 1))
+    gained = np.zeros((len(samples), 3))
     for slot in range(samples.shape[1]):
         h = durations[:, slot, None]
         rate = (samples[:, slot, :3] - gyro_bias) * h
@@ -186,6 +208,7 @@ def imu_on(grid: Grid, table: Table, gyro_bias: Floats) -> Floats:
         gained += _rotate(middle, samples[:, slot, 3:]) * h
         turn = _product(turn, _exp(rate))
     out = np.concatenate((gained, _log(turn)), 1) / grid.dt
+    out = out.reshape(len(tables), grid.count, 6).swapaxes(0, 1)
     out[0] = out[1]
     return out
 
@@ -233,6 +256,11 @@ def last_on(grid: Grid, table: Table) -> tuple[Floats, Flags]:
     there = np.zeros(grid.count, dtype=bool)
     out[step[inside]], there[step[inside]] = table.values[inside], True
     return out, there
+
+
+def _widened(values: Floats, width: int) -> Floats:
+    """[T, S, …] with S = ``width``, by zeros."""
+    return np.pad(values, ((0, 0), (0, width - values.shape[1]), *[(0, 0)] * (values.ndim - 2)))
 
 
 def _interpolate(at: Stamps, time: Stamps, values: Floats) -> Floats:
