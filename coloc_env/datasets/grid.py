@@ -19,7 +19,7 @@ _TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
 _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
 _PHASES = 32  # of a step, tried
-_LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns
+LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns that name one
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 
@@ -73,7 +73,7 @@ def aligned(grid: Grid, recording: Recording, streams: tuple[str, ...]) -> Grid:
         return grid
     period = round(grid.dt * 1e9)
     time = np.concatenate([table.time for table in tables])
-    pairs = [_links(recording, name) for name in streams if name in _LINKS]
+    pairs = [_links(recording, name) for name in streams if name in LINKS]
     best, least = 0, (len(time), np.inf)
     for offset in (i * period // _PHASES for i in range(_PHASES)):
         late = time - grid.start - offset
@@ -92,7 +92,7 @@ def _delivered(grid: Grid, offset: int, time: Stamps) -> NDArray[np.int64]:
 def _links(recording: Recording, stream: str) -> tuple[Stamps, NDArray[np.int64]]:
     """Times and links of all measurements of a stream: two of one link must not share a step."""
     tables = recording.streams[stream]
-    ends = [table.values[:, : _LINKS[stream]].astype(np.int64) for table in tables]
+    ends = [table.values[:, : LINKS[stream]].astype(np.int64) for table in tables]
     owner = np.repeat(np.arange(len(tables)), [len(each) for each in ends])
     whole = np.column_stack((owner, np.concatenate(ends)))
     link = np.unique(whole, axis=0, return_inverse=True)[1].reshape(-1)
@@ -196,7 +196,8 @@ def imu_on(grid: Grid, tables: Sequence[Table], gyro_bias: Floats) -> Floats:
     held = [held_intervals(grid, table) for table in tables]
     width = max(durations.shape[1] for _, durations in held)
     samples, durations = (
-        np.concatenate([_widened(each, width) for each in parts]) for parts in zip(*held, strict=True)
+        np.concatenate([_widened(each, width) for each in parts])
+        for parts in zip(*held, strict=True)
     )  # robot by robot
     gyro_bias = np.repeat(gyro_bias, grid.count, 0)
     turn = np.tile((1.0, 0.0, 0.0, 0.0), (len(samples), 1))
