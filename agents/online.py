@@ -3,34 +3,27 @@
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
+from agents.live_team import LiveTeam
 from agents.localizer import Estimate, finite_action
 from agents.registry import make
-from coloc_env.datasets.grid import Grid
-from coloc_env.datasets.live import LiveSamples, Sample, setup_recording
-from coloc_env.datasets.noise_model import corrected
-from coloc_env.datasets.open_format.description import FILE, read_description
-from coloc_env.datasets.recording import DataError, Recording
-from coloc_env.datasets.replay import arena_of
-from coloc_env.datasets.starts import level
-from coloc_env.network import Network
-from coloc_env.observation import Observation, prior_action
-from coloc_env.scenario import Believed, PriorOptions
-from coloc_env.scenarios.replay import own_beliefs, own_prior, own_team
-from coloc_env.sensors import LandmarkBearings, Sensor, UavBearings
-from coloc_env.sensors.base import Layout
+from coloc_env.datasets.live import Sample
+from coloc_env.datasets.recording import DataError
+from coloc_env.observation import prior_action
+from coloc_env.staging import staged_file
 
 _JUMP = 60.0  # s: a stamp farther from the newest one is of another clock,
 _AGREE = 20  # and where so many in a row are, the team's clock was set
-_LEVEL = 1_000_000_000  # ns of an IMU that show which way is up
 _TIMED = 100_000  # steps of which the duration is remembered
 
 
@@ -101,23 +94,13 @@ class OnlineLocalizer:
                 raise ValueError(f"{name}={value} is not allowed: s from {least} to {_JUMP:g}")
         if depth < 1:
             raise ValueError(f"depth={depth} is not allowed: at least 1")
-        path = Path(setup)
-        path = path / FILE if path.is_dir() else path
-        about = read_description(path)
-        whole = setup_recording(about)
-        model = own_beliefs(whole, path, believed)
-        known = corrected(whole, model)
-        self._team = own_team(known, model, process)
-        used = [s for s in known.streams if s in self._team.sensors or s == self._team.driver]
-        self.samples = LiveSamples(about, whole, model, used, self._team.driver)
-        self.robots, self.agent = about.robots, agent
-        self.dt, self._period = dt, round(dt * 1e9)
+        self._team = LiveTeam(setup, believed, process, dt, depth, prior_std, prior)
+        self.samples, self.robots, self.agent = self._team.samples, self._team.robots, agent
+        self._period = round(dt * 1e9)
         self._horizon, self._wait = round(horizon * 1e9), round(wait * 1e9)
         self._asked = None if start is None else int(self.samples.time(start, "start")[0])
         self._start: int | None = None
-        self._prior_std, self._depth = prior_std, depth
-        self._constants(known, prior)
-        self.localizer = make(agent, self._believed)
+        self.localizer = make(agent, self._team.believed)
         self._past = deque([_Past(-1)], maxlen=2 + self._horizon // self._period)
         self._newest: int | None = None
         self._redo: int | None = None  # the first step that is to be run again
@@ -193,10 +176,11 @@ class OnlineLocalizer:
 
     # ---------------------------------------------------------------- steps
 
-    def steps(self) -> Iterator[Located]:
-        """Run the steps that are due, and give what each comes to."""
+    def steps(self, *, whole: bool = False) -> Iterator[Located]:
+        """Run the steps that are due, and give what each comes to; ``whole``: nothing more is
+        waited for."""
         if self._newest is not None:
-            yield from self._run(self._newest - self._wait - 1)
+            yield from self._run(self._newest - (0 if whole else self._wait + 1))
 
     def estimate(self, stamp: Any) -> Located | None:
         """The team at the last step that is not after ``stamp``, with all that came in for it; None
@@ -237,10 +221,8 @@ class OnlineLocalizer:
             return True
         start = first if self._asked is None else self._asked
         start += max(0, -(-(first - start) // self._period)) * self._period
-        if self._team.driver == "imu" and until < start + _LEVEL and self._prior is None:
-            return False  # which way is up is not known yet
-        if self._prior is None:
-            self._prior = self._drawn_from_setup(Grid(start, self.dt, 2))
+        if not self._team.start_at(start, until):
+            return False
         self._start = start
         return True
 
@@ -248,13 +230,17 @@ class OnlineLocalizer:
         began = time.perf_counter()
         before = self._past[-1]
         k = before.k + 1
-        observation = self._observation(k, before.action)
-        with torch.no_grad():
-            belief = self.localizer.reset(observation) if before.belief is None else before.belief
-            belief, estimate = self.localizer.step(belief, observation)
+        observation = self._team.observation(self._time(k), before.action)
+        belief = before.belief
+        try:
+            with torch.no_grad():
+                belief = self.localizer.reset(observation) if belief is None else belief
+                belief, estimate = self.localizer.step(belief, observation)
+        except (ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
+            raise ValueError(f"{self.agent} broke down at step {k}: {error}") from error
         last = before.action
         if last is None:
-            last = prior_action(observation, self._believed.arena.dim)
+            last = prior_action(observation, self._team.believed.arena.dim)
         action, finite = finite_action(estimate, last)
         if not bool(finite.all()):
             self.counts["not finite"] += 1
@@ -270,7 +256,7 @@ class OnlineLocalizer:
         return self._start + k * self._period
 
     def _located(self, k: int, belief: Any, estimate: Estimate) -> Located:
-        d = self._believed.arena.dim
+        d = self._team.believed.arena.dim
         try:
             state = self.localizer.mean(belief)
             attitude = state[0, :, 2 * d : 2 * d + (1 if d == 2 else 4)].numpy()
@@ -283,88 +269,80 @@ class OnlineLocalizer:
         position = position + self.samples.shift
         return Located(self._time(k), position, velocity, covariance, attitude)
 
-    # ---------------------------------------------------------------- observation
+    # ---------------------------------------------------------------- restarts
 
-    def _constants(self, known: Recording, prior: Float32[Tensor, "N F"] | None) -> None:
-        """All that stays the same: what the team believes, maps, links, who hears whom."""
-        n, grid = len(self.robots), Grid(0, self.dt, 2)
-        network = Network()
-        if not network.dense(n):
-            raise DataError(f"{n} robots are more than the {network.max_neighbours} that fit")
-        pairs = [each(known, grid) for each in self._team.sensors.values()]
-        if self._team.driver:
-            pairs.append(self._team.drive(known, grid, None))
-        sensors = [_deeper(belief, self._depth) for _, belief in pairs]
-        arena = arena_of(known, grid, margin=1.0)
-        layout = Layout(arena, network.slots(n))
-        self._believed = Believed(
-            arena=arena,
-            slots=layout.slots,
-            process=self._team.process,
-            sensors=(*sensors, *self._team.assumed),
-            prior=own_prior(known, PriorOptions(prior_std=self._prior_std)),
-        )
-        self._widths = {
-            name: leaf.width for each in sensors for name, leaf in each.leaves(layout).items()
+    def save(self, path: str | Path) -> None:
+        """Write the belief and the samples that are still needed, as safetensors.
+
+        Raises:
+            ValueError: before the first step, and for a localizer whose belief is not of tensors.
+        """
+        last = self._past[-1]
+        if last.belief is None or last.action is None or self._start is None:
+            raise ValueError("there is no belief to save before the first step")
+        flat = last.belief.to_tensordict().flatten_keys("/")
+        if not all(isinstance(value, Tensor) for value in flat.values()):
+            raise ValueError(f"{self.agent}: its belief cannot be saved")
+        assert self._team.prior is not None
+        tensors = {f"belief/{name}": value for name, value in flat.items()}
+        tensors |= {"action": last.action, "prior": self._team.prior}
+        for stream, team in self.samples.times.items():
+            for robot, times in enumerate(team):
+                rows = np.array(self.samples.rows[stream][robot])
+                if times:
+                    tensors[f"time/{stream}/{robot}"] = torch.tensor(times)
+                    tensors[f"rows/{stream}/{robot}"] = torch.from_numpy(rows)
+        tensors = {name: value.contiguous().clone() for name, value in tensors.items()}
+        about = self._signature | {"start": str(self._start), "k": str(last.k)}
+        with staged_file(Path(path)) as file:
+            file.write_bytes(save(tensors, about))
+
+    def load(self, path: str | Path) -> None:
+        """Go on from what ``save`` wrote.
+
+        Raises:
+            ValueError: the file is missing or damaged, or of another agent, team, step or sensors.
+        """
+        try:
+            with safe_open(path, "pt") as file:
+                about = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except (OSError, SafetensorError) as error:
+            raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+        for name, mine in self._signature.items():
+            if about.get(name) != mine:
+                raise ValueError(f"{path}: is of {name} {about.get(name)!r}, not {mine!r}")
+        try:
+            start, k = int(about["start"]), int(about["k"])
+            self._start, self._team.prior = start, tensors["prior"]
+            fresh = self.localizer.reset(self._team.observation(self._time(k), None))
+            flat = fresh.to_tensordict().flatten_keys("/")
+            for name, value in flat.items():
+                saved = tensors[f"belief/{name}"]
+                if saved.shape[:2] != value.shape[:2]:
+                    raise KeyError(name)
+                flat.set(name, saved)
+            belief = type(fresh).from_tensordict(flat.unflatten_keys("/"))
+            self._past = deque([_Past(k, belief, tensors["action"])], maxlen=self._past.maxlen)
+        except (KeyError, ValueError, IndexError) as error:
+            raise ValueError(f"{path}: holds no such belief: {error}") from None
+        for name, times in tensors.items():
+            kind, *rest = name.split("/")
+            if kind == "time":
+                stream, robot = rest[0], int(rest[1])
+                rows = tensors[f"rows/{stream}/{robot}"].numpy()
+                for stamp, row in zip(times.tolist(), rows, strict=True):
+                    self.samples.insert((stream, robot, stamp, row))
+                    self._newest = max(stamp, self._newest or stamp)
+
+    @property
+    def _signature(self) -> dict[str, str]:
+        """What must be the same where a belief is loaded."""
+        streams = ",".join(self.samples.streams)
+        robots = ",".join(self.robots)
+        return {
+            "agent": self.agent,
+            "robots": robots,
+            "streams": streams,
+            "period": str(self._period),
         }
-        self._maps = {
-            name: value.expand(1, n, -1) for found, _ in pairs for name, value in found.maps.items()
-        }
-        self._links = (1.0 - torch.eye(n)).unsqueeze(0)
-        self._unheard = torch.eye(n, dtype=torch.bool).repeat_interleave(3 * arena.dim, -1)
-        self._prior = None if prior is None else prior.to(torch.float32).unsqueeze(0)
-
-    def _observation(self, k: int, sent: Float32[Tensor, "B N A"] | None) -> Observation:
-        """What ``replay-v0`` delivers at step k."""
-        assert self._prior is not None
-        until = self._time(k)
-        grid = Grid(until - self._period, self.dt, 2)
-        now = self.samples.window(grid.start, until)
-        found = [each(now, grid)[0] for each in self._team.sensors.values()]
-        if self._team.driver:
-            found.append(self._team.drive(now, grid, self.samples.like())[0])
-        leaves = {}
-        for sensor in found:
-            for name, series in sensor.series.items():
-                leaf, width = series.values[1], self._widths.get(name, series.values.shape[-1])
-                if leaf.shape[-1] != width:
-                    leaf = torch.nn.functional.pad(leaf, (0, width - leaf.shape[-1]))
-                leaves[name] = leaf.unsqueeze(0)
-        leaves["links"] = self._links
-        width = self._unheard.shape[-1]
-        if sent is None:
-            leaves["messages"] = torch.zeros(1, len(self.robots), width)
-            leaves["message_mask"] = torch.zeros_like(self._links)
-        else:
-            content = sent.view(1, 1, -1).expand(1, len(self.robots), width)
-            leaves["messages"] = content.masked_fill(self._unheard, 0.0)
-            leaves["message_mask"] = self._links
-        return Observation({**leaves, "prior": self._prior, **self._maps})
-
-    def _drawn_from_setup(self, grid: Grid) -> Float32[Tensor, "B N F"]:
-        """The prior: about the setup's start, level as the IMU shows; else anywhere."""
-        arena, prior, n = self._believed.arena, self._believed.prior, len(self.robots)
-        d = arena.dim
-        first = self.samples.window(grid.start - 1, grid.start + _LEVEL)
-        recording = level(first, grid) if self._team.driver == "imu" else first
-        start = recording.start
-        if not len(start):
-            start = np.full((n, 3 if d == 2 else 7), np.nan)
-        nothing = np.array((0.0,) if d == 2 else (1.0, 0.0, 0.0, 0.0))
-        place = np.where(np.isnan(start[:, :d]), arena.centre, start[:, :d])
-        turn = np.where(np.isnan(start[:, d:]), nothing, start[:, d:])
-        spread = np.full(d, prior.position_std)
-        if prior.kind == "uniform":
-            place, spread = np.tile(arena.centre, (n, 1)), np.subtract(arena.high, arena.low)
-            spread = spread / 12**0.5
-        rest = np.array((prior.velocity_spread, prior.attitude_std))
-        stds = np.tile(np.concatenate((spread, rest)), (n, 1))
-        whole = np.concatenate((place, np.zeros((n, d)), turn, stds), 1)
-        return torch.from_numpy(whole).to(torch.float32).unsqueeze(0)
-
-
-def _deeper(belief: Sensor, depth: int) -> Sensor:
-    """A belief about bearings with room for so many of one thing in a step."""
-    if isinstance(belief, LandmarkBearings | UavBearings):
-        return replace(belief, depth=depth)
-    return belief

@@ -272,13 +272,19 @@ def _interpolate(at: Stamps, time: Stamps, values: Floats) -> Floats:
 
 def _product(a: Floats, b: Floats) -> Floats:
     w = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], 1, keepdims=True)
-    v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+    v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + _cross(a[:, 1:], b[:, 1:])
     return np.concatenate((w, v), 1)
 
 
 def _rotate(q: Floats, v: Floats) -> Floats:
-    t = 2 * np.cross(q[:, 1:], v)
-    return v + q[:, :1] * t + np.cross(q[:, 1:], t)
+    t = 2 * _cross(q[:, 1:], v)
+    return v + q[:, :1] * t + _cross(q[:, 1:], t)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """a × b, row by row: what ``np.cross`` gives, at a third of its price for few rows."""
+    (x, y, z), (u, v, w) = a.T, b.T
+    return np.stack((y * w - z * v, z * u - x * w, x * v - y * u), 1)
 
 
 def _exp(v: Floats) -> Floats:

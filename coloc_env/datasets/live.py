@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from coloc_env.datasets.open_format import streams
 from coloc_env.datasets.open_format.columns import Columns, check_numbers
 from coloc_env.datasets.open_format.description import Description
 from coloc_env.datasets.open_format.reader import described
-from coloc_env.datasets.open_format.stamps import nanoseconds
+from coloc_env.datasets.open_format.stamps import DIGITS, nanoseconds
 from coloc_env.datasets.recording import (
     IMU_COLUMNS,
     DataError,
@@ -116,33 +116,41 @@ class LiveSamples:
     def read(
         self, robot: str, sensor: str, stamp: Any, values: Mapping[str, Any], line: int = 0
     ) -> list[Sample]:
-        """An event as samples in our frames and units, corrected; none where the sensor cannot
-        have measured that.
+        """An event as samples in our frames and units, corrected; none of a stream that is not
+        used, or where the sensor cannot have measured that.
 
-        ``sensor``: a table of the open format (``ranges``, ``imu``, …), ``values`` its columns,
-        ``stamp`` in the setup's unit.
+        ``sensor``: a table of the open format (``ranges``, ``imu``, …), ``values`` its columns
+        (whom or what a sighting or a relative pose is of: ``to``), ``stamp`` in the setup's unit.
 
         Raises:
             DataError: no such robot, sensor or column, a value that is no such thing, or a stream
                 that the setup does not name; ``line`` is named.
         """
-        where = f"event {line}"
+        where = f"event {line}" if line else "event"
         if robot not in self._robots:
             raise DataError(f"{where}: {unknown('robot', str(robot), self.about.robots)}")
         if sensor not in streams.FILES:
             raise DataError(f"{where}: {unknown('sensor', str(sensor), streams.FILES)}")
-        file = streams.FILES[sensor]
-        found = Columns(Path(robot, sensor), self.time(stamp, where), {}, {}, (), [line], "event")
-        for name, value in values.items():
-            if name not in file.columns:
-                _warn_unused(sensor, name)
-            elif file.columns[name] == "name":
-                found.names[name] = ["" if value is None else str(value)]
-            else:
-                found.numbers[name] = np.array([_number(value, f"{where}, column {name}")])
-        check_numbers(found, file.columns)
+        file, path = streams.FILES[sensor], _path(robot, sensor)
+        try:
+            found = Columns(path, self.time(stamp, f"{path}"), {}, {}, (), [1])
+            for name, value in values.items():
+                if name == "to" and "robot" in file.columns:
+                    name = "robot" if value in self._robots else "landmark"
+                if name not in file.columns:
+                    _warn_unused(sensor, name)
+                elif file.columns[name] == "name":
+                    found.names[name] = ["" if value is None else str(value)]
+                else:
+                    found.numbers[name] = np.array([_number(value, f"{path}, column {name}")])
+            check_numbers(found, file.columns)
+            made = file.make(found, self.about)
+        except DataError as error:
+            text = str(error).replace(f"{path}, line 1", f"{path}")
+            columns = ", ".join(dict.fromkeys(("stamp", *map(_as_event, file.columns))))
+            raise DataError(f"{where}: {text} (columns: {columns})") from None
         samples = []
-        for stream, (table, _) in file.make(found, self.about).items():
+        for stream, (table, _) in made.items():
             if stream not in self.about.streams:
                 named = ", ".join(self.about.streams)
                 raise DataError(f"{where}: {stream} is not among the setup's streams: {named}")
@@ -150,11 +158,9 @@ class LiveSamples:
                 continue
             owner = self._robots[robot]
             samples += self._corrected(stream, owner, table)
-            if stream == "uav_ranges" and self.about.once:
-                for time, values_back in zip(table.time, table.values, strict=True):
-                    other, back = int(values_back[1]), streams.seen_back(values_back[None], owner)
-                    again = Table(np.array([time]), back, table.columns)
-                    samples += self._corrected(stream, other, again)
+            if stream == "uav_ranges" and self.about.once and len(table.time):
+                back = replace(table, values=streams.seen_back(table.values, owner))
+                samples += self._corrected(stream, int(table.values[0, 1]), back)
         return samples
 
     def insert(self, sample: Sample) -> bool:
@@ -180,6 +186,11 @@ class LiveSamples:
                 old = min(bisect_right(times, before), len(times)) - 1
                 if old > 0:
                     del times[:old], rows[:old]
+
+    def stamp(self, time: int) -> int | float:
+        """A time in ns as a stamp in the setup's unit."""
+        digits = DIGITS[self.about.unit]
+        return time if digits == 0 else time / 10**digits
 
     def clear(self) -> None:
         """Drop all samples."""
@@ -295,6 +306,11 @@ def _number(value: Any, where: str) -> float:
         raise DataError(f"{where}: {value!r} is not a number") from None
 
 
+def _as_event(column: str) -> str:
+    """What an event calls a column: ``robot`` is whose event it is."""
+    return "to" if column in ("robot", "landmark") else column
+
+
 _unused: set[tuple[str, str]] = set()
 
 
@@ -303,4 +319,9 @@ def _warn_unused(sensor: str, column: str) -> None:
     if (sensor, column) not in _unused and len(_unused) < 100:
         _unused.add((sensor, column))
         allowed = ", ".join(streams.FILES[sensor].columns)
-        warnings.warn(f"{sensor}: not used: {column} (allowed: {allowed})", stacklevel=4)
+        warnings.warn(f"{sensor}: not used: {column}; known: {allowed}", stacklevel=4)
+
+
+@lru_cache(maxsize=1000)
+def _path(robot: str, sensor: str) -> Path:
+    return Path(robot, sensor)

@@ -28,7 +28,9 @@ def first_seconds(recording: Recording, seconds: float, skip: float = 0.0) -> Re
     def cut(each: Any) -> Any:
         there = (each.time >= begins) & (each.time <= ends)
         names = ["time", *(("values",) if isinstance(each, Table) else ("position", "attitude"))]
-        names += [n for n in ("velocity", "gyro_bias", "accel_bias") if getattr(each, n, None) is not None]
+        names += [
+            n for n in ("velocity", "gyro_bias", "accel_bias") if getattr(each, n, None) is not None
+        ]
         return replace(each, **{name: getattr(each, name)[there] for name in names})
 
     truth: tuple[Track, ...] = tuple(map(cut, recording.truth))
@@ -47,7 +49,9 @@ def events_of(folder: Path) -> list[dict[str, Any]]:
                 event: dict[str, Any] = {"robot": path.parent.name, "sensor": path.stem}
                 for name, text in row.items():
                     if text:
-                        event[name] = _value(text)
+                        event["to" if name in ("robot", "landmark") else name] = (
+                            text if name in ("to", "robot", "landmark") else _value(text)
+                        )
                 rows.append(event)
     return sorted(rows, key=lambda row: row["stamp"])
 
