@@ -181,6 +181,8 @@ def unknown_on(grid: Grid, missing: Table, spread: Floats) -> Floats:
     What was not measured is taken to be off by so much for about a second at a time: white noise
     that adds up to the same over a hole is √(2 · 1 s / dt) times that.
     """
+    if not missing.values.any():
+        return np.zeros((grid.count, len(spread)))
     samples, durations = held_intervals(grid, missing)
     share = (samples[..., 0] * durations).sum(1) / grid.dt
     return share[:, None] * spread * np.sqrt(max(1.0, 2 * _LASTING / grid.dt))
@@ -199,15 +201,20 @@ def imu_on(grid: Grid, tables: Sequence[Table], gyro_bias: Floats) -> Floats:
         np.concatenate([_widened(each, width) for each in parts])
         for parts in zip(*held, strict=True)
     )  # robot by robot
-    gyro_bias = np.repeat(gyro_bias, grid.count, 0)
+    turned = (samples[..., :3] - np.repeat(gyro_bias, grid.count, 0)[:, None]) * durations[
+        ..., None
+    ]
+    each, half = (_exp(v.reshape(-1, 3)).reshape(*v.shape[:2], 4) for v in (turned, 0.5 * turned))
     turn = np.tile((1.0, 0.0, 0.0, 0.0), (len(samples), 1))
+    before = np.empty_like(each)
+    for slot in range(width):
+        before[:, slot] = turn
+        turn = _product(turn, each[:, slot])
+    middle = _product(before.reshape(-1, 4), half.reshape(-1, 4))
+    pushed = _rotate(middle, samples[..., 3:].reshape(-1, 3)).reshape(*durations.shape, 3)
     gained = np.zeros((len(samples), 3))
-    for slot in range(samples.shape[1]):
-        h = durations[:, slot, None]
-        rate = (samples[:, slot, :3] - gyro_bias) * h
-        middle = _product(turn, _exp(0.5 * rate))
-        gained += _rotate(middle, samples[:, slot, 3:]) * h
-        turn = _product(turn, _exp(rate))
+    for slot in range(width):
+        gained += pushed[:, slot] * durations[:, slot, None]
     out = np.concatenate((gained, _log(turn)), 1) / grid.dt
     out = out.reshape(len(tables), grid.count, 6).swapaxes(0, 1)
     out[0] = out[1]
