@@ -315,6 +315,13 @@ class OnlineLocalizer:
         try:
             start, k = int(about["start"]), int(about["k"])
             self._start, self._team.prior = start, tensors["prior"]
+            for name, times in tensors.items():
+                if name.startswith("time/"):
+                    _, stream, robot = name.split("/")
+                    rows = tensors[f"rows/{stream}/{robot}"].numpy()
+                    for stamp, row in zip(times.tolist(), rows, strict=True):
+                        self.samples.insert((stream, int(robot), stamp, row))
+                        self._newest = max(stamp, self._newest or stamp)
             fresh = self.localizer.reset(self._team.observation(self._time(k), None))
             flat = fresh.to_tensordict().flatten_keys("/")
             for name, value in flat.items():
@@ -326,14 +333,6 @@ class OnlineLocalizer:
             self._past = deque([_Past(k, belief, tensors["action"])], maxlen=self._past.maxlen)
         except (KeyError, ValueError, IndexError) as error:
             raise ValueError(f"{path}: holds no such belief: {error}") from None
-        for name, times in tensors.items():
-            kind, *rest = name.split("/")
-            if kind == "time":
-                stream, robot = rest[0], int(rest[1])
-                rows = tensors[f"rows/{stream}/{robot}"].numpy()
-                for stamp, row in zip(times.tolist(), rows, strict=True):
-                    self.samples.insert((stream, robot, stamp, row))
-                    self._newest = max(stamp, self._newest or stamp)
 
     @property
     def _signature(self) -> dict[str, str]:

@@ -27,7 +27,9 @@ class MavlinkSender:
         try:
             from pymavlink.dialects.v20 import common
         except ImportError:
-            raise ValueError('--mavlink needs pymavlink: pip install "coloc-env[mavlink]"') from None
+            raise ValueError(
+                '--mavlink needs pymavlink: pip install "coloc-env[mavlink]"'
+            ) from None
         kind, _, rest = address.partition(":")
         host, _, port = rest.rpartition(":")
         if kind != "udp" or not host or not port.isdigit() or not 0 < int(port) < 65536:

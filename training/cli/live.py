@@ -20,7 +20,9 @@ _SAVE_EVERY = 100  # steps
 def live(
     setup: Annotated[
         Path,
-        typer.Argument(metavar="SETUP", help="A **recording.yaml** with **streams**, or its folder."),
+        typer.Argument(
+            metavar="SETUP", help="A **recording.yaml** with **streams**, or its folder."
+        ),
     ],
     agent: Annotated[str, typer.Option(metavar="NAME", help="See **coloc agents**.")] = "ekf",
     believed: Annotated[
