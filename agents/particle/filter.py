@@ -16,6 +16,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements, no_neighbours, received
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
@@ -23,7 +24,7 @@ from agents.particle.belief import ParticleBelief, Step, normal, own_keys
 from agents.particle.cloud import Moments, moments, select
 from agents.particle.degeneracy import Rejuvenation, degenerate
 from agents.particle.likelihood import log_likelihood
-from agents.particle.proposal import draw, importance_density
+from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
@@ -107,6 +108,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             step=torch.zeros_like(key),
             ess_share=torch.ones_like(prior[..., 0]),
             last=mean[..., : 2 * self.process.dim],
+            considered=self.biases.initial(observation, covariance.double()),
             memory=self.screen.memory(observation),
             batch_size=key.shape,
         )
@@ -121,7 +123,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         if any(model.cooperative for model in self.models):
             neighbours = received(self.believed, observation)
         now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
-        particles, log_weights, memory = self._updated(now)
+        particles, log_weights, density = self._updated(now)
         weighed = self.resampling.weigh(particles, log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
             particles, weighed, belief.count, key
@@ -137,9 +139,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
             step=belief.step + 1,
             ess_share=weighed.ess / belief.count,
             last=mean[..., : 2 * self.process.dim],
-            memory=memory,
+            considered=self._considered(now, density),
+            memory=belief.memory if density is None else density.posterior.memory,
         )
-        return after, self._estimate(weighed.cloud)
+        return after, self._estimate(weighed.cloud, after.considered)
 
     def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
         return moments(self.process, belief.particles, belief.log_weights.exp()).mean
@@ -169,10 +172,15 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ),
             count=count,
             last=torch.where(row, state[..., : 2 * self.process.dim], belief.last),
+            considered=torch.where(row.unsqueeze(-1), 0.0, belief.considered),
         )
 
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
-        return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
+        own = {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
+        if any(model.cooperative for model in self.models) and not self.screen.exchanges:
+            message = 4.0 * 3 * self.process.dim
+            own["bytes"] = torch.full_like(belief.ess_share, message)
+        return own
 
     def log_correction(
         self, particles: Float32[Tensor, "B N M S"], belief: ParticleBelief
@@ -189,22 +197,22 @@ class ParticleFilter(Localizer[ParticleBelief]):
 
     def _updated(
         self, now: Step
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Float[Tensor, "B N K"]]:
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], ImportanceDensity | None]:
         """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
-        normalized), and what the screen remembers."""
+        normalized), and the Gaussian update beside it, where anything asks for one."""
         belief = now.belief
         slots = self._slots(belief.count)
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
         draws = normal(now.key, "pf.step", self.process.noise_size, slots)
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        density, memory = None, belief.memory
-        if self.models and (self.screen.judges or self.proposal == "ekf"):
+        density = None
+        if self.models and (self.screen.judges or self.proposal == "ekf" or self.biases):
             particles = self.process.propagate(particles, u, dt, draws)
             density = importance_density(
                 self.screen, self.resampling.floor, particles, log_weights, now
             )
-            now, memory = replace(now, trusts=density.posterior.trusts), density.posterior.memory
+            now = replace(now, trusts=density.posterior.trusts)
             if self.proposal == "ekf":
                 particles, log_weights = draw(self.process, density, now, slots)
             gain = self._evidence(particles, log_weights, now)
@@ -212,11 +220,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
         else:
             particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
         if not (self.models and bool(few.any())):
-            return particles, log_weights + gain, memory
+            return particles, log_weights + gain, density
         rejuvenation = Rejuvenation(
             partial(self._evidence, now=now), self.screen, self.resampling, now
         )
-        return *rejuvenation.rejuvenate(particles, log_weights, gain, few, density), memory
+        return *rejuvenation.rejuvenate(particles, log_weights, gain, few, density), density
 
     def _foresee(
         self,
@@ -252,9 +260,32 @@ class ParticleFilter(Localizer[ParticleBelief]):
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
 
-    def _estimate(self, cloud: Moments) -> Estimate:
+    @property
+    def biases(self) -> Biases:
+        return Biases(self.models, self.process.dt)
+
+    def _considered(self, now: Step, density: ImportanceDensity | None) -> Float[Tensor, "B N E G"]:
+        """What biases make of the error in this step, with the gains of the Gaussian update."""
+        belief, seen = now.belief, now.observation
+        if density is None or not self.biases:
+            return belief.considered
+        dt = elapsed(self.process, belief.step).double()
+        before = self.mean(belief).double()
+        f, _ = self.process.linearize(before, self.process.inputs(seen), dt)
+        considered = self.biases.predict(belief.considered, f, seen)
+        found = density.posterior
+        return self.biases.of_update(
+            considered,
+            density.prior.covariance,
+            found.covariance,
+            found.blocks,
+            found.trusts,
+            seen,
+        )
+
+    def _estimate(self, cloud: Moments, considered: Float[Tensor, "B N E G"]) -> Estimate:
         """The weighted cloud's mean, never surer of the position than the floor."""
-        d, covariance = self.process.dim, cloud.covariance
+        d, covariance = self.process.dim, reported(cloud.covariance, considered)
         least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
         return build(
             Estimate,

@@ -7,6 +7,7 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -61,12 +62,12 @@ class ActionMode(ABC):
         """Lowest and highest numbers of one UAV's action: ±1 for each axis."""
         return [-1.0] * self.dim, [1.0] * self.dim
 
-    @property
+    @cached_property
     def width(self) -> int:
         """How many numbers one UAV's action has."""
         return 1 if self.choices else len(self.bounds[0])
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Shape of one UAV's action."""
         return () if self.choices else (self.width,)
@@ -158,7 +159,7 @@ class Estimates(ActionMode):
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
     ) -> tuple[None, Float32[Tensor, "B N A"]]:
-        return None, action[..., : 3 * self.dim]
+        return None, action[..., : 3 * self.dim] if self.largest or self.calls else action
 
     def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
         d = self.dim

@@ -81,7 +81,6 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
         self.state_space = box(self.mode.state_bounds(scenario))
         self._next_seed: int | None = None
-        self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
         self._window: _Window
         self._renderer = None if render_mode is None else Renderer(scenario)
@@ -109,7 +108,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.seed = checked_seed(seed, self.scenario.name)
         self._next_seed = self.seed + 1
         self.agents = list(self.possible_agents)
-        self.world.reset([self.seed])
+        self.world.restart([self.seed])
         self._window = _Window(self.world)
         self._tallies = {agent: _Tally(self.seed) for agent in self.agents}
         if self._renderer is not None:
@@ -193,7 +192,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if len(agents) < count:
             acting, stacked = stacked, np.zeros((count, *self.mode.shape), np.float32)
             stacked[[self._index[a] for a in agents]] = acting
-        return torch.from_numpy(stacked).unsqueeze(0)
+        return torch.from_numpy(stacked[None])
 
     def _masked(self, infos: dict[str, Any], leaves: Leaves) -> dict[str, Any]:
         """Infos with ``action_mask`` [choices] int8, where actions are choices."""
@@ -211,34 +210,39 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def _observe(self, leaves: Leaves) -> dict[str, Any]:
         """Each agent's leaves, ``leaves`` of the action mode included: rows of copies that nobody
         else has."""
-        world = self.world
-        if world.sensed is not self._window.sensed:
-            self._window = _Window(world)
+        world, window = self.world, self._window
+        if world.sensed is not window.sensed:
+            self._window = window = _Window(world)
         if self.mode.whole and self.mode.flat:
             return self._of(list(leaves["observation"].numpy()[0]))
         if self.mode.whole:
             parts = zip(*(leaf.numpy()[0] for leaf in leaves.values()), strict=True)
             return self._of([dict(zip(leaves, each, strict=True)) for each in parts])
-        messages, heard = world.messages()
-        now = [leaf[world.cursor] for leaf in self._window.leaves]
-        static = [leaf[world.cursor] for leaf in self._window.static]
-        more = [leaf.numpy()[0] for leaf in leaves.values()]
-        names = (*self._names, *leaves)
-        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *static, *more, strict=True)
-        return self._of([dict(zip(names, row, strict=True)) for row in rows])
+        k = world.cursor
+        now = [leaf[k] for leaf in window.leaves]
+        now[window.messages_at] = world.messages().numpy()[0]
+        names = window.names
+        if leaves:
+            now += [leaf.numpy()[0] for leaf in leaves.values()]
+            names = (*names, *leaves)
+        return self._of([dict(zip(names, row)) for row in zip(*now, strict=True)])  # noqa: B905
 
 
 class _Window:
-    """A window of the one world as arrays and lists [K, …], copied once."""
+    """A window of the one world as arrays and lists [K, …], copied once; leaves in the order of the
+    spaces, with room for the messages, which no window has."""
 
     def __init__(self, world: World) -> None:
         self.sensed = sensed = world.sensed
         self.over: list[bool] = sensed.over.tolist()[0]
         self.scored: list[list[bool]] = sensed.scored.tolist()[0]
         self.failed = sensed.failed.numpy()[0]
-        self.leaves = [leaf.numpy()[0].copy() for leaf in sensed.leaves.values()]
         each = (sensed.count, 1, 1)
-        self.static = [np.tile(leaf.numpy(), each) for leaf in world.static.values()]
+        leaves = {name: leaf.numpy()[0].copy() for name, leaf in sensed.leaves.items()}
+        leaves |= {name: np.tile(leaf.numpy(), each) for name, leaf in world.static.items()}
+        self.names = tuple(all_leaves(world.scenario))
+        self.messages_at = self.names.index("messages")
+        self.leaves = [leaves.get(name, self.over) for name in self.names]
 
 
 class _Tally:

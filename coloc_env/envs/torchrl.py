@@ -22,7 +22,9 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
 from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.sensing import Sensed
-from coloc_env.world import World
+from coloc_env.world import World, steps_ahead
+
+_LONGEST = 128  # steps sensed ahead at most: rollouts are short beside episodes
 
 
 class CoLocEnv(EnvBase):
@@ -54,7 +56,7 @@ class CoLocEnv(EnvBase):
         scenario = scenario_from(scenario, overrides)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.scenario = scenario
-        self.world = World(scenario, num_envs, device)
+        self.world = World(scenario, num_envs, device, steps_ahead(scenario, num_envs, _LONGEST))
         self.mode = make_mode(scenario, action)
         self.group_map = {"uav": scenario.agents[: self.mode.n_agents]}
         self._runner = ModeRunner(self.mode, self.world)
@@ -101,6 +103,7 @@ class CoLocEnv(EnvBase):
             low, high = ends
             shape = (b, n, self._runner.width)
             action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
+        self._actions = action
         self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
         reward = Unbounded((b, n, 1), device, torch.float32)
         self.reward_spec = Composite(uav=Composite(reward=reward, shape=(b, n)), shape=(b,))
@@ -119,6 +122,13 @@ class CoLocEnv(EnvBase):
         """The action mode's memory at the step last observed."""
         return self._runner.memory
 
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Actions drawn as their spec draws them, written into ``tensordict`` if given. (What every
+        ``EnvBase`` does by way of a TensorDict for each level of the spec.)"""
+        if tensordict is None:
+            tensordict = TensorDict({}, self.batch_size, self.device)
+        return tensordict.set(("uav", "action"), self._actions.rand())
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.first_seed = checked_seed(seed, self.scenario.name)
@@ -129,7 +139,7 @@ class CoLocEnv(EnvBase):
         rows = None
         if tensordict is not None and "_reset" in tensordict.keys():  # noqa: SIM118
             rows = tensordict["_reset"].view(-1)
-        self.world.reset(self._seeds, rows)
+        self.world.restart(self._seeds, rows)
         moved = self._seeds + self.batch_size[0]
         self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
         return self._observe(self._runner.reset(rows)).copy()
@@ -148,6 +158,7 @@ class CoLocEnv(EnvBase):
             self._sensed = self.world.sensed
             self._frames = self._window(self._sensed).unbind(1)
         out = self._frames[self.world.cursor]
+        out.set("state", self._runner.state())
         if self.mode.whole:
             if self.mode.flat:
                 out["uav"].set("observation", leaves["observation"])
@@ -157,15 +168,11 @@ class CoLocEnv(EnvBase):
                 out["uav"].set("observation", each)
             if "action_mask" in leaves:
                 out["uav"].set("action_mask", leaves["action_mask"] > 0)
-            out.set("state", self._runner.state())
             return out
-        observation = out["uav", "observation"]
-        messages, heard = self.world.messages()
-        observation.set("messages", messages)
-        observation.set("message_mask", heard)
+        observation = out["uav"]["observation"]
+        observation.set("messages", self.world.messages())
         for name, leaf in leaves.items():
             observation.set(name, leaf)
-        out.set("state", self._runner.state())
         return out
 
     def _window(self, sensed: Sensed) -> TensorDict:
