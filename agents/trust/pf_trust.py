@@ -18,4 +18,6 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
 
     def __init__(self, believed: Believed, *, weights: str = "trust", **options: Any) -> None:
         super().__init__(believed, **options)
+        if self.printed:
+            raise ValueError("variant=paper trusts all measurements alike: apf and pfnn have it")
         self.screen = learned_screen(self.process, self.models, weights, options)
