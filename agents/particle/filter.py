@@ -51,8 +51,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ``variant=paper`` is the PF-NN paper's filter as printed instead of this ``regularized`` one:
     particles uniform in the arena at the start, plain weights (a neighbour counts as if its
     estimate were exact), resampling and counts as its Algorithms 1 and 2 have them,
-    N(0, ``perturb_std``²) m added to positions and a tenth of it (m/s) to velocities, no tempering
-    and no redraw.
+    N(0, ``perturb_std``²) m added to positions, a tenth of it to velocities (m/s) and attitudes
+    (rad), no tempering and no redraw.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
     ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.

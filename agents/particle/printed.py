@@ -15,20 +15,21 @@ from coloc_env import noise
 from coloc_env.scenario import Believed
 
 PERTURB_STD = 0.1  # m; the paper gives none
-_VELOCITY = 0.1  # of it, m/s
+_SHARE = 0.1  # of it on velocities (m/s) and attitudes (rad)
 
 
 class PrintedResampling(Resampling):
     """Algorithm 2 as printed, called as Algorithm 1 does: where the effective sample size is below
     half of the count, and only there does the count change. ``perturb_std`` (m) is the position's
-    part of Σ_perturb."""
+    part of Σ_perturb. (Where attitudes are not perturbed, those of a cloud that was resampled to
+    few particles stay wrong, gravity leaks into its velocity, and every UAV is lost.)"""
 
     def __init__(
         self, process: Process, perturb_std: float, bounds: tuple[int, int] | None
     ) -> None:
         super().__init__(process, "fixed", bounds)
-        parts = {"position": perturb_std, "velocity": _VELOCITY * perturb_std}
-        std = dict.fromkeys(("attitude", "accel", "gyro"), 0.0) | parts
+        std = dict.fromkeys(("velocity", "attitude"), _SHARE * perturb_std)
+        std |= {"position": perturb_std, "accel": 0.0, "gyro": 0.0}
         self.perturb = torch.tensor(per_error(process, std), dtype=torch.float32)
 
     def weigh(
