@@ -247,8 +247,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
             return particles, log_weights + gain, renewed, memory
         evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
         rejuvenation = Rejuvenation(evidence, self.screen, self.resampling, now, renews)
-        *cloud, late = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
-        return *cloud, renewed | late, memory
+        found = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
+        return found[0], found[1], renewed | found[2], memory
 
     def _foresee(
         self,
