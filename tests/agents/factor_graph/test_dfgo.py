@@ -1,4 +1,4 @@
-"""The fixed-lag smoother: exact where the world is linear, consistent, and nothing counted twice."""
+"""The fixed-lag smoother: exact where the world is linear, consistent, nothing counted twice."""
 
 from types import SimpleNamespace
 from typing import Any
