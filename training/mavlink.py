@@ -2,6 +2,7 @@
 
 import math
 import socket
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +38,10 @@ class MavlinkSender:
                 f"--mavlink {address} is not allowed: udp:HOST:PORT, as in udp:127.0.0.1:14550"
             )
         try:
-            family, *_, self._to = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
+            family, *_, to = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
         except socket.gaierror:
             raise ValueError(f"--mavlink {address}: there is no host {host}") from None
+        self._to: Any = to
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._links = [common.MAVLink(None, 1 + i, _COMPONENT) for i in range(robots)]
 

@@ -105,6 +105,9 @@ VARIANTS = (
     "ekf:fusion=exchange",
     "ekf_joint:robust=huber",
     "pf500:perturb=fixed:tempering=false",
+    "apf:variant=paper",
+    "pfnn:variant=paper",
+    "dfgo:exchange=all",
 )
 REFUSED = {("ekf_joint", "slots")}
 # Families where a localizer's own code meets something new. Those that only extend another (pfnn
@@ -118,6 +121,7 @@ CHOSEN = {
     **dict.fromkeys(("pfnn", "pf_trust"), ("default", "plane")),
     "mappo": ("default", "slots", "plane"),
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
+    "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
@@ -186,6 +190,8 @@ def build(name: str, scenario: Scenario) -> Localizer:
     few: dict[str, Any] = {"particles": PARTICLES} if "particles" in known else {}
     if "bounds" in known and known["bounds"].default is not None:
         few["bounds"] = (PARTICLES - 10, PARTICLES + 20)
+    if name.startswith("dfgo"):
+        few["window"] = 3
     if "every" in known:
         few["every"] = 2
     if "weights" in known:

@@ -88,7 +88,8 @@ def test_late_events_within_the_horizon_change_nothing_in_the_end(
     late = sorted(events, key=lambda e: e["stamp"] + rng.uniform(0, 4e8) * (e["stamp"] > 4e8))
     online = OnlineLocalizer("ekf", folder)
     shuffled, straight = last(online, late), last(OnlineLocalizer("ekf", folder), events)
-    assert online.counts["late"] > 10 and online.counts["run again"] > 10
+    assert online.counts["late"] > 10
+    assert online.counts["run again"] > 10
     np.testing.assert_allclose(shuffled.position, straight.position, atol=1e-9)
     np.testing.assert_allclose(shuffled.covariance, straight.covariance, atol=1e-9)
 
@@ -119,7 +120,8 @@ def test_one_robot_whose_clock_jumps_is_left_out(folder: Path, events: Events) -
     found = run(online, jumped)
     assert online.counts["of another clock"] == sum(e["stamp"] > 10**12 for e in jumped)
     assert online.counts["clock set"] == 0
-    assert found[-1].stamp < 10**10 and np.isfinite(found[-1].position).all()
+    assert found[-1].stamp < 10**10
+    assert np.isfinite(found[-1].position).all()
 
 
 def test_the_team_goes_on_where_its_clock_is_set(folder: Path, events: Events) -> None:
@@ -181,9 +183,10 @@ def test_malformed_events_are_refused_in_one_line(
     folder: Path, events: Events, change: dict[str, Any], said: str
 ) -> None:
     event = next(e for e in events if e["sensor"] == "ranges")
-    with pytest.raises(DataError, match=".") as raised:
+    with pytest.raises(DataError) as raised:
         OnlineLocalizer("ekf", folder).add(**{**event, **change})
-    assert said in str(raised.value) and "\n" not in str(raised.value)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_a_setup_must_say_what_is_to_come(folder: Path, tmp_path: Path) -> None:

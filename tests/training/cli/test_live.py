@@ -37,7 +37,8 @@ def test_estimates_are_one_line_a_robot_and_step(folder: Path, tmp_path: Path) -
     assert np.array(found[-1]["covariance"]).shape == (2, 2)
     assert len({(each["stamp"], each["robot"]) for each in found}) == len(found)
     assert "event 1: 'not json' is no JSON object" in result.stderr
-    assert "malformed 2" in result.stderr and "ms a step: median" in result.stderr
+    assert "malformed 2" in result.stderr
+    assert "ms a step: median" in result.stderr
     assert state.exists()
 
 
@@ -53,7 +54,8 @@ def test_mavlink_receiver_gets_ned_with_covariance(folder: Path) -> None:
     sent = json.loads(result.stdout.splitlines()[0])
     message = receiver.recv_match(type="VISION_POSITION_ESTIMATE", blocking=True, timeout=5)
     receiver.close()
-    assert message is not None and message.get_srcSystem() == 1
+    assert message is not None
+    assert message.get_srcSystem() == 1
     assert message.usec == sent["stamp"] // 1000
     east, north = sent["position"]
     np.testing.assert_allclose((message.x, message.y), (north, east), rtol=1e-6)
@@ -85,4 +87,5 @@ def test_attitude_in_ned_against_the_definition() -> None:
 
 def test_mavlink_address_is_checked(folder: Path) -> None:
     result = CliRunner().invoke(app, ["live", str(folder), "--mavlink", "serial"], input="")
-    assert result.exit_code == 2 and "udp:HOST:PORT" in result.stderr
+    assert result.exit_code == 2
+    assert "udp:HOST:PORT" in result.stderr
