@@ -24,6 +24,8 @@ RANGES: dict[str, Any] = {
     "uwb_impulse": 0.5,
     "uwb_impulse_size": 99.0,
     "uwb_dropout": 0.5,
+    "range_bias_std": 0.5,
+    "range_bias_time": 3.0,
 }
 DELAYED = {**RANGES, "uwb_delay": 1}
 LANDMARKS: dict[str, Any] = {
@@ -153,6 +155,7 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
+    "range_bias_time": {"range_bias_std": 0.5},
 }
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
 STEERED: dict[str, dict[str, Any]] = {
