@@ -161,7 +161,7 @@ def test_scores_are_the_protocols(tmp_path: Path) -> None:
     name, _, options = KINDS["held"]
     weights = runs.start(name, options | {"score_worlds": 5}, tmp_path / "run", quiet)
     card = json.loads(weights.with_suffix(".json").read_text())
-    task = make_task(options["task"])
+    task = make_task(options["task"]).with_options(reward="true")
     total = torch.zeros(5)
     for step in rollout(task, load_policy(task, str(weights)), FIRST_SEED + torch.arange(5)):
         total += step.reward.mean(-1)
