@@ -56,19 +56,21 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     """Build a localizer for what the scenario's team believes (or for those beliefs).
 
     ``name`` may carry options as on the command line (``"ekf:robust=huber"``); a piece without "="
-    belongs to the option before, so that paths may have colons. Raises ValueError, in one line that
+    belongs to the option before, and so does one that names no option where either is a path: paths
+    may have colons. Raises ValueError, in one line that
     names what is allowed, for an unknown name or option, and for a team that measures what the
     localizer would ignore.
     """
     name, *pieces = name.split(":")
+    factory = LOCALIZERS.require(name)
+    known = options.of(factory)
     texts: list[str] = []
     for piece in pieces:
-        if texts and "=" not in piece:
+        key, given, _ = piece.partition("=")
+        if texts and (not given or (key not in known and _is_path(texts[-1], piece))):
             texts[-1] += f":{piece}"
         else:
             texts.append(piece)
-    factory = LOCALIZERS.require(name)
-    known = options.of(factory)
     for text in texts:
         key, value = options.parse(name, text, known)
         if key in chosen:
@@ -84,6 +86,10 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
     return made
+
+
+def _is_path(*texts: str) -> bool:
+    return any("/" in text or ".safetensors" in text for text in texts)
 
 
 def _require_served(name: str, factory: Factory, believed: Believed) -> None:

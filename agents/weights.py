@@ -47,7 +47,7 @@ class Learned(nn.Module):
     order, so that weights never meet inputs of another meaning."""
 
     kind: ClassVar[str]
-    features: ClassVar[tuple[str, ...]]
+    features: tuple[str, ...]
     architecture: Mapping[str, Any] = {}
 
 

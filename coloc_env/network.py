@@ -186,7 +186,9 @@ class NetworkOptions(Group):
     """UAVs up to ``comm_radius`` m apart (none: however far) measure each other and exchange
     messages. In each step a link is broken for both with probability ``link_failure``, and carries
     no message one way with probability ``message_loss``; messages take ``message_delay`` steps more
-    than the one that they always take.
+    than the one that they always take. ``links``: ``all`` in reach exchange; or the team's actions
+    say who calls whom (``chosen``; others' calls within ``interference`` of the one called, none:
+    ``comm_radius``, spoil it) or who speaks (``broadcast``).
     """
 
     title: ClassVar[str] = "network"
@@ -195,6 +197,8 @@ class NetworkOptions(Group):
     link_failure: Share = 0.0
     message_loss: Share = 0.0
     message_delay: Count = 0
+    links: Links = "all"
+    interference: PositiveMetres | None = None
 
     def network(self, **others: Any) -> Network:
         """The network; ``others``: fields of ``Network`` that are no options."""
@@ -203,6 +207,8 @@ class NetworkOptions(Group):
             loss=self.message_loss,
             delay=self.message_delay,
             failure=self.link_failure,
+            links=self.links,
+            interference=self.interference,
             **others,
         )
 

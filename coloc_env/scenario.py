@@ -7,7 +7,7 @@ from math import inf
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from coloc_env.motion import Arena, Motion
-from coloc_env.network import Network
+from coloc_env.network import Links, Network
 from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Share
 from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor
@@ -148,6 +148,7 @@ class Believed:
 
     Positions of landmarks and anchors come in the observation's map leaves. ``largest_command``:
     where motion is steered, the largest component of a command (m/s or m/s²) that has any effect.
+    ``links``: who exchanges with whom (see ``Network``).
     """
 
     arena: Arena
@@ -157,6 +158,7 @@ class Believed:
     prior: Prior
     message_delay: int = 0
     largest_command: float = 0.0
+    links: Links = "all"
 
     def sensor(self, kind: type[S]) -> S | None:
         """The believed model of a sensor type, or None if the team has no such sensor."""
@@ -172,7 +174,9 @@ class Scenario:
     ``anchor_uavs``: the first so many UAVs know where they are and are not scored. ``reference``:
     what is to be reported beside the truth as if it were the truth (None: nothing). ``targets``:
     the last so many UAVs are passive: others range to them, they range neither anchors nor each
-    other. ``strangers``: the first so many UAVs do not range each other.
+    other. ``strangers``: the first so many UAVs do not range each other. ``tuned_on``: sequences of
+    recordings on which constants of the scenario were chosen, so that no score on them is one on
+    data unseen.
     """
 
     name: str
@@ -192,6 +196,7 @@ class Scenario:
     reference: SatelliteReference | None = None
     targets: int = 0
     strangers: int = 0
+    tuned_on: tuple[str, ...] = ()
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -229,6 +234,7 @@ class Scenario:
             prior=self.believed_prior or self.prior,
             message_delay=self.network.delay,
             largest_command=self.motion.largest,
+            links=self.network.links,
         )
 
     @property

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -54,16 +54,15 @@ class Frame(NamedTuple):
 
     ``target`` is the position that estimates are scored against, ``over`` is true from the horizon
     on, ``failed`` in the very step in which a UAV fails. A message for slot s comes from UAV
-    ``senders[…, s]`` (None: from UAV s); ``heard`` is where one gets through, ``unheard`` which
-    of all slots' numbers stay 0.
+    ``senders[…, s]`` (None: from UAV s); ``bits`` are those of its numbers that arrive: all or
+    none.
     """
 
     target: Float32[Tensor, "R N d"]
     over: Bool[Tensor, "R"]
     failed: Bool[Tensor, "R N"]
     scored: Bool[Tensor, "R N"]
-    unheard: Bool[Tensor, "R N S*A"]
-    heard: Float32[Tensor, "R N S"]
+    bits: Int32[Tensor, "R N S*A"]
     senders: Int64[Tensor, "R N S"] | None
 
 
@@ -80,8 +79,7 @@ class Sensed(_Rows):
     alive: Bool[Tensor, "R K N"]
     failed: Bool[Tensor, "R K N"]
     scored: Bool[Tensor, "R K N"]
-    unheard: Bool[Tensor, "R K N S*A"]
-    heard: Float32[Tensor, "R K N S"]
+    bits: Int32[Tensor, "R K N S*A"]
     senders: Int64[Tensor, "R K N S"] | None
     leaves: dict[str, Float32[Tensor, "R K N F"]]
 
@@ -190,8 +188,10 @@ def sense(
     leaves: dict[str, Tensor] = {}
     for sensor, own in zip(scenario.sensors, placed, strict=True):
         leaves |= sensor.sample(seen if sensor.may_be_blind else window, own)
-    heard = network.delivered(step_keys, neighbours, reach)
-    leaves["links"] = heard.to(torch.float32)
+    delivered = network.delivered(step_keys, neighbours, reach)
+    leaves["links"] = delivered.to(torch.float32)
+    arrived = delivered & (steps > network.delay)[..., None, None]  # before, none was sent
+    leaves["message_mask"] = arrived.to(torch.float32)
     dense = network.dense(arena.n_uavs)
     scored = alive if moved.valid is None else alive & moved.valid
     if scenario.anchor_uavs:
@@ -208,8 +208,7 @@ def sense(
         alive=alive,
         failed=steps.unsqueeze(-1) == fails_at,
         scored=scored,
-        unheard=(~heard).repeat_interleave(action_width(scenario), -1),
-        heard=leaves["links"].clone(),
+        bits=_repeated(arrived.to(torch.int32).neg_(), action_width(scenario)),
         senders=None if dense else neighbours,
         leaves=leaves,
     )
@@ -223,6 +222,11 @@ def _where_known(window: Window, valid: Bool[Tensor, "R K N"]) -> Window:
     return replace(
         window, alive=window.alive & valid, reach=window.reach & valid.unsqueeze(-1) & other
     )
+
+
+def _repeated(x: Int32[Tensor, "R K N S"], times: int) -> Int32[Tensor, "R K N S*A"]:
+    """Each number so many times in a row."""
+    return x.unsqueeze(-1).expand(*x.shape, times).flatten(-2)
 
 
 def _join(before: Tensor, now: Tensor) -> Tensor:

@@ -130,8 +130,9 @@ def _made(parent: Path, out: Path) -> Iterator[Path]:
         yield partial
         done = True
     except OSError as error:
-        if error.filename is None and error.errno is not None:
-            error.filename = str(out)  # the error of a full disk does not name it
+        hidden = str(error.filename or partial).startswith(str(partial))
+        if hidden and error.errno is not None:
+            error.filename = str(out)  # a full disk names nothing, others what is hidden
         raise
     finally:
         _remove(partial)

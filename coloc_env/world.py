@@ -28,6 +28,12 @@ _NEVER = 1 << 62
 Leaves = dict[str, Float32[Tensor, "B *K N F"]]
 
 
+def steps_ahead(scenario: Scenario, batch_size: int, longest: int = _LONGEST) -> int:
+    """How many steps it pays to sense at once."""
+    at_once = _AGENT_STEPS // max(1, batch_size * scenario.arena.n_uavs)
+    return max(1, min(at_once, longest, scenario.horizon + 1))
+
+
 class Step(NamedTuple):
     """What one step of the world brings.
 
@@ -66,15 +72,14 @@ class World:
         self.scenario = scenario
         self.batch_size = batch_size
         self.device = torch.device(device)
-        ahead = _AGENT_STEPS // (batch_size * scenario.arena.n_uavs)
-        self.window = window or max(1, min(ahead, _LONGEST, scenario.horizon + 1))
+        self.window = window or steps_ahead(scenario, batch_size)
         if scenario.commanded:
             self.window = 1
         self._rows = max(1, _AGENT_STEPS // (self.window * scenario.arena.n_uavs))
         if self.device.type != "cpu":
             self._rows = batch_size
         self._delay = scenario.network.delay
-        self._width = action_width(scenario)
+        self._dim, self._width = scenario.arena.dim, action_width(scenario)
         self._static_names = tuple(static_leaves(scenario))
         self.cursor = -1
         self._zero = torch.zeros((), dtype=torch.float32, device=self.device)
@@ -92,6 +97,13 @@ class World:
         ignored. Raises ValueError for another number of seeds, and for one that is not a whole
         number from 0 to 2⁶².
         """
+        self.restart(seeds, rows)
+        return self.observation()
+
+    def restart(
+        self, seeds: Int64[Tensor, "B"] | Sequence[int] | int, rows: Bool[Tensor, "B"] | None = None
+    ) -> None:
+        """``reset`` without the observation: for a face, which builds its own."""
         seeds = checked_seeds(seeds, self.batch_size, self.device)
         if rows is None or self.cursor < 0 or bool(rows.all()):
             self.seeds = seeds.clone()
@@ -100,8 +112,6 @@ class World:
             self._sense(torch.zeros_like(seeds), None)
         else:
             self._reset_rows(seeds, rows.nonzero()[:, 0])
-        self._since_reset = 0
-        return self.observation()
 
     def _place(self, seeds: Int64[Tensor, "B"]) -> None:
         """All that is drawn once an episode."""
@@ -111,8 +121,8 @@ class World:
         self._placed = [sensor.place(keys, scenario.layout) for sensor in scenario.sensors]
         self._fails_at = self._failures(keys)
         n = scenario.arena.n_uavs
-        self.messages_sent = torch.zeros(len(keys), n, dtype=torch.int64, device=keys.device)
-        self._calls = torch.full_like(self.messages_sent, SILENT)
+        self._called = torch.zeros(len(keys), n, dtype=torch.int64, device=keys.device)
+        self._calls = torch.full_like(self._called, SILENT)
         self._static: dict[str, Tensor] = {}
         for sensor, placed in zip(scenario.sensors, self._placed, strict=True):
             for name, value in sensor.map_values(placed).items():
@@ -137,7 +147,7 @@ class World:
             return
         left = self.sensed.map(lambda x: x[:, self.cursor :])
         fresh = World(self.scenario, len(rows), self.device, left.count)
-        fresh.reset(seeds[rows])
+        fresh.restart(seeds[rows])
 
         def merge(old: Tensor, new: Tensor) -> Tensor:
             return old.index_put((rows,), new)
@@ -146,7 +156,7 @@ class World:
         self._keys = merge(self._keys, fresh._keys)
         self._fails_at = merge(self._fails_at, fresh._fails_at)
         self._calls = merge(self._calls, fresh._calls)
-        self.messages_sent = merge(self.messages_sent, fresh.messages_sent)
+        self._called = merge(self._called, fresh._called)
         self._carry = {k: merge(v, fresh._carry[k]) for k, v in self._carry.items()}
         self._static = {k: merge(v, fresh._static[k]) for k, v in self._static.items()}
         self._placed = [
@@ -208,8 +218,8 @@ class World:
         Estimates are float32, and so is the truth they are scored against: the true position as an
         action has an error of exactly 0.
         """
-        now, dim = self.now, self.scenario.arena.dim
-        error = torch.linalg.vector_norm(estimates[..., :dim] - now.target, dim=-1)
+        now = self.now
+        error = torch.linalg.vector_norm(estimates.narrow(-1, 0, self._dim) - now.target, dim=-1)
         if not self.sensed.all_scored:  # chosen, not multiplied: nobody's NaN counts as 0
             error = torch.where(now.scored, error, self._zero)
         return error, now.scored
@@ -219,14 +229,14 @@ class World:
     ) -> None:
         """Send (copies of) the estimates as messages and move to the next step."""
         self._command(commands or Commands())
-        self._sent.append(estimates.clone(memory_format=torch.contiguous_format))
+        sent = estimates.clone(memory_format=torch.contiguous_format)
+        self._sent.append(sent.view(torch.int32).view(self.batch_size, 1, -1))
         self.cursor += 1
-        self._since_reset += 1
         if self.cursor == self.sensed.count:
             self._sense(self.sensed.steps[:, -1] + 1, self._past)
 
     def _command(self, commands: Commands) -> None:
-        """Take the commands of the step to come, and count what is sent in it."""
+        """Take the commands of the step to come, and count the calls in it."""
         scenario = self.scenario
         motion, calls = commands
         if motion is not None:
@@ -240,7 +250,6 @@ class World:
                 )
             self._carry = {**self._carry, "command": motion.to(torch.float64, copy=True)}
         if scenario.network.links == "all":
-            self.messages_sent = self.messages_sent + self.alive
             return
         calls = torch.full_like(self._calls, SILENT) if calls is None else calls
         if calls.shape != self._calls.shape or calls.dtype != torch.int64:
@@ -249,14 +258,21 @@ class World:
                 f"fit: int64 of shape {tuple(self._calls.shape)} (worlds, UAVs) are needed"
             )
         self._calls = torch.where(self.alive, calls, SILENT)
-        self.messages_sent = self.messages_sent + (self._calls >= 0)
+        self._called = self._called + (self._calls >= 0)
 
     # ---------------------------------------------------------------- views
 
     @property
+    def messages_sent(self) -> Int64[Tensor, "B N"]:
+        """Messages that each UAV has sent since its reset: one a step until it fails, or as many as
+        it called where links are chosen or broadcast."""
+        if self.scenario.network.links == "all":
+            return torch.minimum(self.step_index.unsqueeze(-1), self._fails_at)
+        return self._called
+
+    @property
     def bytes_sent(self) -> Int64[Tensor, "B N"]:
-        """Bytes that each UAV has sent since its reset: float32 numbers of an estimate a message.
-        (``messages_sent``: how many messages.)"""
+        """Bytes of these messages: float32 numbers of an estimate each."""
         return 4 * self._width * self.messages_sent
 
     @property
@@ -276,6 +292,17 @@ class World:
         return self.sensed.alive[:, self.cursor]
 
     @property
+    def links(self) -> Bool[Tensor, "B N N"]:
+        """Whether a message that UAV j sends now would reach UAV i."""
+        heard = self.sensed.leaves["links"][:, self.cursor] > 0
+        senders = self.now.senders
+        if senders is None:
+            return heard
+        n = heard.shape[1]
+        counts = torch.zeros(len(heard), n, n, dtype=torch.int64, device=self.device)
+        return counts.scatter_add_(2, senders.expand(heard.shape), heard.long()) > 0
+
+    @property
     def step_index(self) -> Int64[Tensor, "B"]:
         """The step each row is at: 0 after its reset."""
         return self.sensed.steps[:, self.cursor]
@@ -289,51 +316,38 @@ class World:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""
         return self.sensed.states[:, self.cursor].clone()
 
-    def messages(self) -> tuple[Float32[Tensor, "B N F"], Float32[Tensor, "B N S"]]:
-        """Delivered messages and their mask: senders' actions of 1 + delay steps ago."""
+    def messages(self) -> Float32[Tensor, "B N F"]:
+        """Delivered messages: senders' actions of 1 + delay steps ago, 0 where there is none."""
         now = self.now
         if len(self._sent) <= self._delay:
-            b, n, slots = now.heard.shape
-            return now.heard.new_zeros(b, n, slots * self._width), torch.zeros_like(now.heard)
-        sent, heard, unheard = self._sent[0], now.heard, now.unheard
-        if self._since_reset <= self._delay:
-            early = (self.step_index <= self._delay)[:, None, None]
-            heard, unheard = heard.masked_fill(early, 0.0), unheard | early
-        if now.senders is None:
-            content = sent.view(len(sent), 1, -1)
-        else:
-            rows = torch.arange(len(sent), device=self.device)[:, None, None]
-            content = sent[rows, now.senders].flatten(-2)
+            return torch.zeros_like(now.bits, dtype=torch.float32)
+        sent = self._sent[0]
+        if now.senders is not None:
+            rows = torch.arange(self.batch_size, device=self.device)[:, None, None]
+            sent = sent.unflatten(-1, (-1, self._width))[rows, 0, now.senders].flatten(-2)
         # Chosen, not multiplied: a diverged sender's NaN reaches only those who hear it.
-        return torch.where(unheard, self._zero, content), heard.clone()
+        return (sent & now.bits).view(torch.float32)
 
     def observation(self) -> Observation:
         """What every UAV observes at the current step."""
         if self._observed is not self.sensed:
             self._observed = self.sensed
             self._frames = self._leaf_frames()
-        messages, mask = self.messages()
-        leaves, static = self._frames[self.cursor]
-        return Observation({**leaves, "messages": messages, "message_mask": mask, **static})
+        return Observation({**self._frames[self.cursor], "messages": self.messages()})
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the copies: each view would bring its whole window along."""
         state = {k: v for k, v in self.__dict__.items() if k != "_frames"}
         return {**state, "_observed": None}
 
-    def _leaf_frames(self) -> list[tuple[Leaves, Leaves]]:
-        """Leaves sensed and static of each step in the window.
+    def _leaf_frames(self) -> list[Leaves]:
+        """Leaves of each step in the window, messages aside.
 
         Copies, so that edits in place by those who observe reach no other step, and cut in one go:
         far cheaper than one step at a time.
         """
         count = self.sensed.count
         leaves = {name: leaf.clone() for name, leaf in self.sensed.leaves.items()}
-        static = {k: v.unsqueeze(1).repeat(1, count, 1, 1) for k, v in self.static.items()}
-        return list(zip(_by_step(leaves), _by_step(static), strict=True))
-
-
-def _by_step(window: Leaves) -> list[Leaves]:
-    """Leaves [B, K, N, F] as K times leaves [B, N, F]."""
-    parts = (leaf.unbind(1) for leaf in window.values())
-    return [dict(zip(window, views, strict=True)) for views in zip(*parts, strict=True)]
+        leaves |= {k: v.unsqueeze(1).repeat(1, count, 1, 1) for k, v in self.static.items()}
+        parts = (leaf.unbind(1) for leaf in leaves.values())
+        return [dict(zip(leaves, views, strict=True)) for views in zip(*parts, strict=True)]

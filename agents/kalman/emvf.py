@@ -32,6 +32,8 @@ from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Layout
 
 _NOTHING = 1e-6  # m⁻², s²/m²: information on position and velocity before anything is measured
+_FLAT = 1e-6  # of anchors' spread: no extent at all
+_BESIDE = 0.1  # of the room's extent on one side of the anchors' plane: nothing on the other
 _RIDGE = 1e-3  # m⁻²: what keeps a trilateration near the arena's centre where it is ambiguous
 
 
@@ -81,10 +83,26 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
         if not self.models:
             raise ValueError("the team measures nothing of its own to estimate from")
-        if not self.models:
-            raise ValueError("needs measurements of landmarks or anchors, and the team has none")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
+        self.normal = _normal(believed)
+        if self.normal is not None and all(isinstance(m, AnchorRanges) for m in self.models):
+            self._require_one_side(self.normal)
+
+    def _require_one_side(self, normal: Float64[Tensor, "d"]) -> None:
+        """ValueError if the room lies on both sides of the anchors' plane."""
+        sensor, arena = self.believed.sensor(AnchorRanging), self.believed.arena
+        assert sensor is not None
+        corners = torch.cartesian_prod(*torch.tensor((arena.low, arena.high)).double().T)
+        side = (corners - torch.tensor(sensor.anchors[0])) @ normal
+        low, high = -float(side.min()), float(side.max())
+        if min(low, high) > _BESIDE * max(low, high):
+            flat = "plane" if arena.dim == 3 else "line"
+            raise ValueError(
+                f"all {len(sensor.anchors)} anchors lie in one {flat} through the room: ranges to "
+                "them alone do not say on which side of it a UAV is; add anchors beside it, "
+                "landmarks, or choose ekf or pf500, which have a prior"
+            )
 
     @classmethod
     def ignores(cls, believed: Believed) -> list[str]:
@@ -232,7 +250,8 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
 
     def _trilaterated(self, leaves: Observation) -> Float64[Tensor, "B N d"]:
         """Where all ranges of the window, taken as of one place, meet: z² = ‖p‖² − 2 a·p + ‖a‖² is
-        linear in (p, ‖p‖²). The arena's centre without anchors."""
+        linear in (p, ‖p‖²). With anchors in a plane, n·a = c, what is found is ‖p‖² − 2 c n·p, and
+        n·p is that root which is on the room's side. The arena's centre without anchors."""
         d, arena = self.process.dim, self.believed.arena
         centre = leaves["prior"].new_tensor(arena.centre).double()
         sensor = self.believed.sensor(AnchorRanging)
@@ -250,4 +269,22 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         ridge[..., -1] = _RIDGE**2
         normal = design.mT @ design + torch.diag_embed(ridge)
         found = torch.linalg.solve(normal, (design.mT @ target.unsqueeze(-1))[..., 0])
-        return centre + found[..., :d]
+        place = found[..., :d]
+        if self.normal is not None:
+            n = self.normal.to(place)
+            c = (anchors[..., 0, :] @ n).flatten(2)[..., 0]
+            place = place - (place @ n).unsqueeze(-1) * n
+            q = found[..., d] - place.square().sum(-1)  # t² − 2 c t, t = n·p
+            t = c - c.sign() * (c.square() + q).clamp_min(0.0).sqrt()
+            place = place + t.unsqueeze(-1) * n
+        return centre + place
+
+
+def _normal(believed: Believed) -> Float64[Tensor, "d"] | None:
+    """Unit normal of the plane (in the plane: line) that all anchors lie in; None if none does."""
+    sensor = believed.sensor(AnchorRanging)
+    if sensor is None or len(sensor.anchors) < believed.arena.dim:
+        return None
+    places = torch.tensor(sensor.anchors, dtype=torch.float64)
+    _, spread, axes = torch.linalg.svd(places - places.mean(0))
+    return axes[-1] if spread[-1] <= _FLAT * spread[0] else None

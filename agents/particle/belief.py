@@ -19,7 +19,8 @@ class ParticleBelief(TensorClass):
     """Particles (float32) with normalized log-weights (−∞ for slots beyond ``count``), the UAV's
     own random key, steps taken, the last effective sample size as a share of its count, whether the
     last step redrew it from an EKF's posterior, position and velocity of the last estimate (of the
-    prior before), and what the screen remembers; batch (B, N)."""
+    prior before), what sensors' biases have made of the error (see ``agents.models.biases``), and
+    what the screen remembers; batch (B, N)."""
 
     particles: Float32[Tensor, "B N M S"]
     log_weights: Float32[Tensor, "B N M"]
@@ -29,6 +30,7 @@ class ParticleBelief(TensorClass):
     ess_share: Float32[Tensor, "B N"]
     renewed: Bool[Tensor, "B N"]
     last: Float32[Tensor, "B N 2*d"]
+    considered: Float[Tensor, "B N E G"]
     memory: Float[Tensor, "B N K"]
 
     def shifted(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":

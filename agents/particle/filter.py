@@ -15,6 +15,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements, no_neighbours, received
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
@@ -23,7 +24,7 @@ from agents.particle.cloud import Moments, moments, select
 from agents.particle.degeneracy import Rejuvenation, degenerate
 from agents.particle.likelihood import log_likelihood
 from agents.particle.printed import PERTURB_STD, PrintedResampling, anywhere
-from agents.particle.proposal import draw, importance_density
+from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
@@ -129,6 +130,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ess_share=torch.ones_like(prior[..., 0]),
             renewed=torch.zeros_like(key, dtype=torch.bool),
             last=mean[..., : 2 * self.process.dim],
+            considered=self.biases.initial(observation, covariance.double()),
             memory=self.screen.memory(observation),
             batch_size=key.shape,
         )
@@ -145,7 +147,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             if self.printed:
                 neighbours = replace(neighbours, variance=torch.zeros_like(neighbours.variance))
         now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
-        particles, log_weights, renewed, memory = self._updated(now)
+        particles, log_weights, renewed, density = self._updated(now)
         weighed = self.resampling.weigh(particles, log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
             particles, weighed, belief.count, key
@@ -163,9 +165,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ess_share=weighed.ess / belief.count,
             renewed=renewed,
             last=mean[..., : 2 * self.process.dim],
-            memory=memory,
+            considered=self._considered(now, density),
+            memory=belief.memory if density is None else density.posterior.memory,
         )
-        return after, self._estimate(cloud)
+        return after, self._estimate(cloud, after.considered)
 
     def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
         return moments(self.process, belief.particles, belief.log_weights.exp()).mean
@@ -195,14 +198,19 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ),
             count=count,
             last=torch.where(row, state[..., : 2 * self.process.dim], belief.last),
+            considered=torch.where(row.unsqueeze(-1), 0.0, belief.considered),
         )
 
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
-        return {
+        own = {
             "particles": belief.count.to(torch.float32),
             "ess_share": belief.ess_share,
             "renewed": belief.renewed.to(torch.float32),
         }
+        if any(model.cooperative for model in self.models) and not self.screen.exchanges:
+            message = 4.0 * 3 * self.process.dim
+            own["bytes"] = torch.full_like(belief.ess_share, message)
+        return own
 
     def log_correction(
         self, particles: Float32[Tensor, "B N M S"], belief: ParticleBelief
@@ -219,23 +227,28 @@ class ParticleFilter(Localizer[ParticleBelief]):
 
     def _updated(
         self, now: Step
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"], Tensor]:
+    ) -> tuple[
+        Float32[Tensor, "B N M S"],
+        Float32[Tensor, "B N M"],
+        Bool[Tensor, "B N"],
+        ImportanceDensity | None,
+    ]:
         """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
-        normalized), which were redrawn from an EKF's posterior, and what the screen remembers."""
+        normalized), which were redrawn from an EKF's posterior, and the Gaussian update beside it,
+        where anything asks for one."""
         belief = now.belief
         slots = self._slots(belief.count)
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
         draws = normal(now.key, "pf.step", self.process.noise_size, slots)
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        density, memory = None, belief.memory
-        renewed = torch.zeros_like(belief.renewed)
-        if self.models and (self.screen.judges or self.proposal == "ekf"):
+        density, renewed = None, torch.zeros_like(belief.renewed)
+        if self.models and (self.screen.judges or self.proposal == "ekf" or self.biases):
             particles = self.process.propagate(particles, u, dt, draws)
             density = importance_density(
                 self.screen, self.resampling.floor, particles, log_weights, now
             )
-            now, memory = replace(now, trusts=density.posterior.trusts), density.posterior.memory
+            now = replace(now, trusts=density.posterior.trusts)
             if self.proposal == "ekf":
                 particles, log_weights = draw(self.process, density, now, slots)
                 renewed = ~renewed
@@ -244,11 +257,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
         else:
             particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
         if not (self.models and bool(few.any())):
-            return particles, log_weights + gain, renewed, memory
+            return particles, log_weights + gain, renewed, density
         evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
         rejuvenation = Rejuvenation(evidence, self.screen, self.resampling, now, renews)
         found = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
-        return found[0], found[1], renewed | found[2], memory
+        return found[0], found[1], renewed | found[2], density
 
     def _foresee(
         self,
@@ -284,9 +297,32 @@ class ParticleFilter(Localizer[ParticleBelief]):
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
 
-    def _estimate(self, cloud: Moments) -> Estimate:
+    @property
+    def biases(self) -> Biases:
+        return Biases(self.models, self.process.dt)
+
+    def _considered(self, now: Step, density: ImportanceDensity | None) -> Float[Tensor, "B N E G"]:
+        """What biases make of the error in this step, with the gains of the Gaussian update."""
+        belief, seen = now.belief, now.observation
+        if density is None or not self.biases:
+            return belief.considered
+        dt = elapsed(self.process, belief.step).double()
+        before = self.mean(belief).double()
+        f, _ = self.process.linearize(before, self.process.inputs(seen), dt)
+        considered = self.biases.predict(belief.considered, f, seen)
+        found = density.posterior
+        return self.biases.of_update(
+            considered,
+            density.prior.covariance,
+            found.covariance,
+            found.blocks,
+            found.trusts,
+            seen,
+        )
+
+    def _estimate(self, cloud: Moments, considered: Float[Tensor, "B N E G"]) -> Estimate:
         """The weighted cloud's mean, never surer of the position than the floor."""
-        d, covariance = self.process.dim, cloud.covariance
+        d, covariance = self.process.dim, reported(cloud.covariance, considered)
         least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
         return build(
             Estimate,

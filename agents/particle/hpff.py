@@ -3,6 +3,7 @@
 NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filter.
 """
 
+from agents.bank import BankOptions
 from agents.particle.failure import ChiSquare
 from agents.particle.hybrid import HybridFilter
 from coloc_env.options import OpenShare, PositiveCount
@@ -24,7 +25,8 @@ class Hpff(HybridFilter):
         auxiliary: str = "emvf",
         quantile: OpenShare = 0.98,
         patience: PositiveCount = 1,
+        bank: BankOptions = BankOptions(),  # noqa: B008
     ) -> None:
         sensor = believed.sensor(AnchorRanging)
         most = 0 if sensor is None else len(sensor.anchors) * sensor.n_tags
-        super().__init__(believed, ChiSquare(quantile, most), main, auxiliary, 0.5, patience)
+        super().__init__(believed, ChiSquare(quantile, most), main, auxiliary, 0.5, patience, bank)

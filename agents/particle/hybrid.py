@@ -10,21 +10,24 @@ from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.bank import BankOptions, Trial
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
-from agents.particle.failure import Detector, evidence
+from agents.particle.failure import Detector, Evidence, evidence
 from agents.registry import make
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging
 
+_ILL = 30.0  # ratio of standard deviations beyond which a position is a line
+
 
 class HybridBelief(TensorClass):
     """Both filters' beliefs, the Mahalanobis distance d and the probability of a failure that were
     found last, for how many steps in a row it counts as failed, and whether the main filter was
-    restarted in the last; batch (B, N)."""
+    restarted in the last (or a restart was put on trial); batch (B, N)."""
 
     main: Any
     auxiliary: Any
@@ -42,6 +45,10 @@ class HybridFilter(Localizer[HybridBelief]):
     ``threshold``: the probability beyond which a failure counts; 1: never. ``patience``: for so
     many steps in a row it must count before anything is restarted. An auxiliary that finds itself
     outside the arena, or knows no more than that it is inside, restarts nothing.
+
+    Restarts are on trial (``agents.bank.Trial``): the main filter speaks until one has predicted
+    better, and the auxiliary's place must besides be well-posed and fit what is measured better.
+    ``bank=false``: they take effect at once.
     """
 
     name = "hybrid"
@@ -54,6 +61,7 @@ class HybridFilter(Localizer[HybridBelief]):
         auxiliary: str,
         threshold: float,
         patience: int,
+        bank: BankOptions,
     ) -> None:
         super().__init__(believed)
         sensor = believed.sensor(AnchorRanging)
@@ -65,6 +73,9 @@ class HybridFilter(Localizer[HybridBelief]):
             raise ValueError(f"main={main!r} is not allowed: a particle or Kalman filter")
         if type(self.auxiliary).gaussian is Localizer.gaussian:
             raise ValueError(f"auxiliary={auxiliary!r} is not allowed: emvf or a Kalman filter")
+        self.on_trial = bank.bank
+        if self.on_trial:
+            self.main = Trial(self.main, bank)
         self.detector, self.threshold, self.patience = detector, threshold, patience
         self.process, self.model = make_process(believed), AnchorRanges(sensor)
         arena = (believed.arena.low, believed.arena.high)
@@ -99,14 +110,17 @@ class HybridFilter(Localizer[HybridBelief]):
             d = self.process.dim
             spread, like = covariance[..., :d, :d], estimate.position
             rows = rows & self._usable(state[..., :d], spread)
+            if self.on_trial:
+                rows = rows & self._sound(state, spread, seen, observation)
             main = self.main.restart_from(main, rows, state, covariance)
-            row = rows.unsqueeze(-1)
-            estimate = Estimate(
-                position=torch.where(row, state[..., :d].to(like), like),
-                velocity=torch.where(row, state[..., d : 2 * d].to(like), estimate.velocity),
-                covariance=torch.where(row.unsqueeze(-1), spread, estimate.covariance),
-                batch_size=rows.shape,
-            )
+            if not self.on_trial:
+                row = rows.unsqueeze(-1)
+                estimate = Estimate(
+                    position=torch.where(row, state[..., :d].to(like), like),
+                    velocity=torch.where(row, state[..., d : 2 * d].to(like), estimate.velocity),
+                    covariance=torch.where(row.unsqueeze(-1), spread, estimate.covariance),
+                    batch_size=rows.shape,
+                )
         after = build(
             HybridBelief,
             rows.shape,
@@ -126,11 +140,9 @@ class HybridFilter(Localizer[HybridBelief]):
         return belief.replace(main=self.main.shifted(belief.main, offset))
 
     def diagnostics(self, belief: HybridBelief) -> dict[str, Float[Tensor, "B N"]]:
-        return self.main.diagnostics(belief.main) | {
-            "mahalanobis": belief.distance,
-            "failure": belief.probability,
-            "resets_per_run": belief.reset.float(),
-        }
+        own = {"mahalanobis": belief.distance, "failure": belief.probability}
+        own["trials_per_run" if self.on_trial else "resets_per_run"] = belief.reset.float()
+        return self.main.diagnostics(belief.main) | own
 
     def _usable(
         self, position: Float[Tensor, "B N d"], covariance: Float[Tensor, "B N d d"]
@@ -139,6 +151,21 @@ class HybridFilter(Localizer[HybridBelief]):
         low, high = (end.to(position.device) for end in (self._low, self._high))
         inside = ((position >= low) & (position <= high)).all(-1)
         return inside & (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) < self._anywhere)
+
+    def _sound(
+        self,
+        state: Float[Tensor, "B N S"],
+        covariance: Float[Tensor, "B N d d"],
+        seen: Evidence,
+        observation: Observation,
+    ) -> Bool[Tensor, "B N"]:
+        """Whether the auxiliary's position is known about as well in all directions (condition),
+        and leaves less of what is measured now than the main filter's (cost)."""
+        variances = torch.linalg.eigvalsh(covariance)
+        posed = (variances[..., 0] > 0) & (variances[..., -1] < _ILL**2 * variances[..., 0])
+        where = state if self.model.tags else state[..., : self.process.dim]
+        left = evidence(self.model, self.process, where, observation)
+        return posed & (left.distance < seen.distance)
 
     def _state(self, main: Any, estimate: Estimate) -> Float[Tensor, "B N S"]:
         """What distances to anchors need to know of the main filter's state."""

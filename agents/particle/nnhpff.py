@@ -3,6 +3,7 @@
 NN-HPFF paper: particle filter, Mahalanobis test or neural network, and FIR filter.
 """
 
+from agents.bank import BankOptions
 from agents.particle.failure import FailureDetector, NeuralDetector
 from agents.particle.hybrid import HybridFilter
 from agents.weights import learned
@@ -25,9 +26,12 @@ class NeuralHpff(HybridFilter):
         weights: str = "nnhpff",
         threshold: Share = 0.5,
         patience: PositiveCount = 1,
+        bank: BankOptions = BankOptions(),  # noqa: B008
     ) -> None:
         network = learned(FailureDetector, weights).requires_grad_(False)
-        super().__init__(believed, NeuralDetector(network), main, auxiliary, threshold, patience)
+        super().__init__(
+            believed, NeuralDetector(network), main, auxiliary, threshold, patience, bank
+        )
 
     def learn(self, network: FailureDetector) -> None:
         """Judge by this network from now on."""

@@ -104,7 +104,7 @@ class Actor(Learned):
             "activation": activation,
             "squash": squash,
         }
-        self.features = tuple(f"{name}[{width}]" for name, width in inputs.items())  # type: ignore[misc]
+        self.features = tuple(f"{name}[{width}]" for name, width in inputs.items())
         self.squash = SQUASHES[squash]
         self.body = Body(sum(inputs.values()), hidden, 1 if recurrent else 2, activation)
         self.lstm = nn.LSTM(hidden, hidden, batch_first=True) if recurrent else None

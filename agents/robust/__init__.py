@@ -1,6 +1,7 @@
 """Which measurements to trust: screens that every filter's update works through."""
 
+from agents.robust.capped import Capped
 from agents.robust.combined import METHODS, RobustScreen
 from agents.robust.screen import Fixed, Prediction, Screen, Trust
 
-__all__ = ["METHODS", "Fixed", "Prediction", "RobustScreen", "Screen", "Trust"]
+__all__ = ["METHODS", "Capped", "Fixed", "Prediction", "RobustScreen", "Screen", "Trust"]

@@ -26,6 +26,13 @@ def whitened_squares(
     Components apart: for the few that a measurement has, hundreds of solves become some twenty
     products, and no number depends on how many others are computed beside it.
     """
+    return _eliminated(residual, covariance)[0]
+
+
+def _eliminated(
+    residual: Sequence[Float[Tensor, "*#s"]], covariance: Sequence[Sequence[Float[Tensor, "*#s"]]]
+) -> tuple[list[Float[Tensor, "*s"]], list[Float[Tensor, "*s"]]]:
+    """``whitened_squares``' terms, and the pivots D, whose product is |S|."""
     r, terms = list(residual), []
     s = [list(row) for row in covariance]
     for j in range(len(r)):
@@ -35,17 +42,25 @@ def whitened_squares(
             r[i] = r[i] - factor * r[j]
             for c in range(j + 1, i + 1):
                 s[i][c] = s[i][c] - factor * s[c][j]
-    return terms
+    return terms, [s[j][j] for j in range(len(r))]
 
 
 def mahalanobis_squared(
     block: Block, covariance: Float[Tensor, "B N E E"]
 ) -> Float[Tensor, "B N m"]:
     """rᵀ (H P Hᵀ + R)⁻¹ r of each measurement's innovation under the prior covariance P."""
+    terms = innovation_terms(block, covariance)[0]
+    return sum(terms[1:], terms[0])
+
+
+def innovation_terms(
+    block: Block, covariance: Float[Tensor, "B N E E"]
+) -> tuple[list[Float[Tensor, "B N m"]], list[Float[Tensor, "B N m"]]]:
+    """Of each innovation r and its S = H P Hᵀ + R: k terms whose sum is rᵀ S⁻¹ r, and k numbers
+    whose product is |S|."""
     h, r = block.jacobian, block.residual.unbind(-1)
     spread = h @ covariance.unsqueeze(-3)
     s = [[(spread[..., i, :] * h[..., j, :]).sum(-1) for j in range(i + 1)] for i in range(len(r))]
     for i, noise in enumerate(block.total_variance.unbind(-1)):
         s[i][i] = s[i][i] + noise
-    terms = whitened_squares(r, s)
-    return sum(terms[1:], terms[0])
+    return _eliminated(r, s)

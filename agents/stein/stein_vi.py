@@ -121,7 +121,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
             last.information, covariance, last.information @ covariance[..., _POSE, :]
         )
         posterior = 0.5 * (posterior + posterior.mT)
-        count = observation["landmark_mask"].double().sum(-1)
+        count = block.mask.double().sum(-1)
         after = build(
             SteinViBelief,
             belief.step.shape,

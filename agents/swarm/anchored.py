@@ -17,10 +17,13 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
+from agents.models.measurements import make_measurements
 from agents.models.process import make_process
 from agents.swarm import joint
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.centres import Centres
+from agents.swarm.considered import Moments, after_step
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import Links
 from agents.swarm.marginals import block_diagonal, range_update, with_marginals
@@ -29,6 +32,7 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
 from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors.base import usable
 
 _M = TypeVar("_M", bound=SwarmFilter)
 _SURVEYED = 1e-3  # m: standard deviation of anchors' positions, per axis
@@ -36,11 +40,13 @@ _MIN_VARIANCE = 1e-6  # m² per axis: of a position that is believed to be exact
 
 
 class AnchoredBelief(TensorClass):
-    """State and error covariance of each UAV's motion model, steps taken, and the UAVs' part of the
-    swarm filter's belief in the team and the anchors; batch (B, N)."""
+    """State and error covariance of each UAV's motion model, what sensors' biases have made of the
+    error (see ``agents.models.biases``), steps taken, and the UAVs' part of the swarm filter's
+    belief in the team and the anchors; batch (B, N)."""
 
     state: Float64[Tensor, "B N S"]
     covariance: Float64[Tensor, "B N E E"]
+    considered: Float64[Tensor, "B N E G"]
     step: Int64[Tensor, "B N"]
     swarm: SwarmBelief
 
@@ -75,6 +81,8 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         if self.swarm.window:
             raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
+        models = make_measurements(believed)
+        self.biases = Biases([m for m in models if m.bias_std], self.process.dt)
 
     @property
     def exchanges(self) -> bool:
@@ -90,6 +98,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         return AnchoredBelief(
             state=state,
             covariance=covariance,
+            considered=self.biases.initial(observation, covariance),
             step=torch.zeros(state.shape[:2], dtype=torch.int64, device=state.device),
             swarm=_uavs(swarm, state.shape[1]),
             batch_size=state.shape[:2],
@@ -120,11 +129,21 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         recursive = self.swarm.recursive
         take = self.navigation.replace_marginal if recursive else self.navigation.update
         state, covariance = take(state, covariance, position, posterior)
+        considered = after_step(
+            self.biases,
+            self.process,
+            belief.considered,
+            Moments(belief.state, belief.covariance),
+            Moments(state, covariance),
+            dt,
+            observation,
+        )
         after = build(
             AnchoredBelief,
             shape,
             state=state,
             covariance=covariance,
+            considered=considered,
             step=belief.step + 1,
             swarm=_uavs(updated, shape[1]),
         )
@@ -133,7 +152,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             shape,
             position=state[..., :d],
             velocity=state[..., d : 2 * d],
-            covariance=covariance[..., :d, :d],
+            covariance=reported(covariance, considered)[..., :d, :d],
         )
         return after, estimate
 
@@ -156,7 +175,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             arena=replace(self.believed.arena, n_uavs=members),
             slots=members,
             process=InsDriven(),
-            sensors=(Ranging(ranging.noise), Ins(std=0.0), fixes),
+            sensors=(Ranging(replace(ranging.noise, bias_std=0.0)), Ins(std=0.0), fixes),
         )
 
     def _member_observation(
@@ -165,16 +184,19 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         """What the members observe: links, and fixes of anchors and of UAVs that have one. Their
         positions are predicted already, so that their velocity is zero."""
         n = links.mask.shape[-1] - anchors.shape[1]
-        fix, fixed = (anchors.new_zeros(len(anchors), n, k) for k in (self.process.dim, 1))
+        fix = anchors.new_zeros(len(anchors), n, self.process.dim)
+        fixed = torch.zeros_like(fix[..., :1], dtype=torch.bool)
         if self.fixed is not None:
-            fix, fixed = observation["position_fix"].double(), observation["position_fix_mask"]
+            there = observation["position_fix_mask"] > 0
+            z, fixed = usable(observation["position_fix"].double().unsqueeze(-2), there)
+            fix = z[..., 0, :]
         fix = torch.cat((fix, anchors), 1)
         leaves = {
             "ins": torch.zeros_like(fix),
             "ranges": links.distance,
             "range_mask": links.mask,
             "position_fix": fix,
-            "position_fix_mask": torch.cat((fixed > 0, torch.ones_like(anchors[..., :1]) > 0), 1),
+            "position_fix_mask": torch.cat((fixed, torch.ones_like(anchors[..., :1]) > 0), 1),
         }
         return Observation(leaves)
 

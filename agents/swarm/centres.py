@@ -8,6 +8,7 @@ from agents.swarm.links import Links, lengths, ranges_of
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import AnchorRanging, Ranging
+from coloc_env.sensors.base import usable
 from coloc_env.sensors.ranging import Tags
 
 
@@ -82,8 +83,9 @@ class Centres:
         rotation: Float64[Tensor, "B N d d"] | None,
     ) -> tuple[Links, Float64[Tensor, "B N A"]]:
         shape = (sensor.n_tags, -1)
-        ranges = observation["anchor_ranges"].double().unflatten(-1, shape).mT  # [B, N, A, T]
-        mask = (observation["anchor_range_mask"] > 0).unflatten(-1, shape).mT & ranges.isfinite()
+        z = observation["anchor_ranges"].double().unsqueeze(-1)
+        z, there = usable(z, observation["anchor_range_mask"] > 0, ranges=True)
+        ranges, mask = (x.unflatten(-1, shape).mT for x in (z[..., 0], there))  # [B, N, A, T]
         arms, variance = _arms(sensor.tags, position, rotation)
         if arms is not None:
             difference = self.anchor_positions(observation).unsqueeze(1) - position.unsqueeze(2)

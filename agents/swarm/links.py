@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from coloc_env.observation import Observation
+from coloc_env.sensors.base import usable
 
 
 @dataclass(frozen=True)
@@ -19,8 +20,7 @@ class Links:
 
 
 def links_of(observation: Observation) -> Links:
-    """The links that either end reports, in teams with one tag a UAV; without ranges that are not
-    finite."""
+    """The links that either end reports, in teams with one tag a UAV."""
     ranges, mask = (x[..., 0, 0] for x in ranges_of(observation, 1))
     return Links(ranges, mask)
 
@@ -32,8 +32,9 @@ def ranges_of(
     either end reports, and which there are: from the leaves ``ranges`` and ``range_mask`` and, in
     teams with more UAVs than slots, ``neighbours``."""
     shape = (-1, tags, tags)
-    ranges = observation["ranges"].double().unflatten(-1, shape)
-    mask = (observation["range_mask"] > 0).unflatten(-1, shape) & ranges.isfinite()
+    z = observation["ranges"].double().unsqueeze(-1)
+    z, there = usable(z, observation["range_mask"] > 0, ranges=True)
+    ranges, mask = z[..., 0].unflatten(-1, shape), there.unflatten(-1, shape)
     n = ranges.shape[1]
     if "neighbours" in observation:
         index = observation["neighbours"].to(torch.int64)[..., None, None].expand(mask.shape)

@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from agents.tasks.task import Policy, Seen, Task, TaskMemory
+from agents.tasks.memory import TaskMemory
+from agents.tasks.rules import Policy, Seen
+from agents.tasks.task import Task
 from coloc_env.envs.actions import ModeRunner, checked_tensor
 from coloc_env.world import World
 

@@ -7,26 +7,21 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from agents.tasks.gains import anchor_gains, log_gain, range_gains, rank
-from agents.tasks.task import (
-    ESTIMATOR,
-    MOST_ERROR,
-    Seen,
-    Task,
-    TaskMemory,
-    idle,
-    own_sigma,
-    random_policy,
-    sensors,
-    task_scenario,
-)
+from agents.tasks.memory import TaskMemory, own_sigma
+from agents.tasks.options import Drift, TaskOptions
+from agents.tasks.rules import Seen, idle, random_policy
+from agents.tasks.space import Space
+from agents.tasks.task import MOST_ERROR, Task, sensors, task_scenario
 from coloc_env.commands import SILENT, Commands
-from coloc_env.motion import Arena, Roam
+from coloc_env.motion import Roam
 from coloc_env.network import Network
+from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
 _SIDE, _RADIUS = 100.0, 45.0
+_WALLS = (((30.0, 30.0), (33.0, 70.0)), ((67.0, 30.0), (70.0, 70.0)))
 _ANCHORS = ((0.0, 0.0), (100.0, 100.0))
 
 
@@ -106,9 +101,11 @@ class Schedule(Task):
     """Six UAVs on waypoints that they do not steer share a channel; each may call one other UAV or
     anchor a step, and calls collide.
 
-    Reward: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise, m/√m.
+    Reward of each: minus the own error / 10, of errors up to 10 m. ``drift``: odometry's noise,
+    m/√m.
     """
 
+    name = "schedule-v0"
     policies: ClassVar = {
         "random": random_policy,
         "idle": idle,
@@ -120,7 +117,14 @@ class Schedule(Task):
         "central": central,
     }
     best = "local"
-    team_reward = False
+    sampled = True
+    about: ClassVar = {
+        "gain": "log of what each call but silence would take off the own variance, 10⁻³ … 10 m² "
+        "as −1 … 1",
+        "ranks": "rank of the own σ and of the best gain among all",
+        "success": "whether the UAV ranged to anybody, and whether it is its turn",
+        "called": "whether each called in the last step, the own first, then (i + k) mod N",
+    }
     meaning = "0 for silence, k for UAV (i + k) mod N, N … for an anchor"
 
     def __init__(
@@ -128,25 +132,27 @@ class Schedule(Task):
         *,
         n_uavs: PositiveCount = 6,
         horizon: PositiveCount = 100,
-        drift: float = 0.25,
-        estimator: str = ESTIMATOR,
+        drift: Drift = 0.25,
+        task: TaskOptions = TaskOptions(credit="own"),
     ) -> None:
         self.choices = n_uavs + len(_ANCHORS)
+        space = Space((_SIDE, _SIDE), self.hard, _WALLS)
         scenario = task_scenario(
-            "schedule-v0",
-            sensors(_ANCHORS, 0.05, drift, _RADIUS),
-            arena=Arena(2, n_uavs, 1.0, (0.0, 0.0), (_SIDE, _SIDE)),
+            self.name,
+            sensors(space.anchors(_ANCHORS), 0.05, drift, _RADIUS, space.walls),
+            arena=space.arena(n_uavs),
             horizon=horizon,
-            motion=Roam(2.0),
+            motion=Roam(2.0, space.over()),
             network=Network(
-                radius=_RADIUS,
+                _RADIUS,
+                space.walls,
                 links="chosen",
                 interference=_RADIUS,
                 max_neighbours=max(16, n_uavs),
             ),
             prior=Prior(2.0),
         )
-        super().__init__(scenario, n_uavs, estimator, _RADIUS, 2.0)
+        super().__init__(scenario, n_uavs, task, _RADIUS, 2.0)
 
     def targets_of(self, n: int) -> Int64[Tensor, "n C"]:
         """Whom each UAV calls by each choice but the first: a UAV, or N + m for anchor m."""
@@ -172,7 +178,7 @@ class Schedule(Task):
         names = ("gain", "team_gain", "distance")
         return {"called": blank.clone(), **{name: each.clone() for name in names}}
 
-    def keep(self, memory: TaskMemory) -> TaskMemory:
+    def keep(self, memory: TaskMemory, observation: Observation) -> TaskMemory:
         """Predicted gains (m²) of each call, the UAV's own and the team's."""
         n, b = self.n_agents, len(memory.position)
         p, joint = memory.position, memory.joint
@@ -194,18 +200,35 @@ class Schedule(Task):
         inside = memory.more["distance"] <= self.radius
         return torch.cat((torch.ones_like(inside[..., :1]), inside), -1)
 
-    def extras(self, memory: TaskMemory) -> list[Float32[Tensor, "B n F"]]:
-        """Gain of each call, ranks of σ and gain, success and calls of all, whose turn it is."""
-        n = self.n_agents
-        gain, sigma = memory.more["gain"], own_sigma(memory.joint)
-        ranks = [rank(sigma), rank(gain.amax(-1))]
+    def extras(self, memory: TaskMemory) -> dict[str, Float32[Tensor, "B n F"]]:
+        """Where agents know what they heard, there are no ranks, and calls are of those heard."""
+        n, gain = self.n_agents, memory.more["gain"]
         i = torch.arange(n)
-        others = (i[:, None] + torch.arange(n)) % n
-        called = (memory.more["called"] > 0).to(gain.dtype)[:, others]
-        success = memory.seen.any(-1).to(gain.dtype)
+        success = memory.seen.any(-1)
         turn = (memory.step - i) % n == 0
-        flags = torch.stack((*ranks, 2 * success - 1, 2 * turn.to(gain.dtype) - 1), -1)
-        return [log_gain(gain), flags, 2 * called - 1]
+        flags = 2 * torch.stack((success, turn), -1).to(gain.dtype) - 1
+        others = (i[:, None] + torch.arange(n)) % n
+        called = (memory.more["called"] > 0)[:, others]
+        found = {"gain": log_gain(gain)}
+        if self.messages:
+            heard = memory.seen[:, i[:, None], others]
+            called = called & (heard | (others == i[:, None]))
+        else:
+            ranks = rank(own_sigma(memory.joint)), rank(gain.amax(-1))
+            found["ranks"] = torch.stack(ranks, -1)
+        return {**found, "success": flags, "called": 2 * called.to(gain.dtype) - 1}
 
-    def reward(self, memory: TaskMemory, world: World) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
-        return memory, -self.error(memory, world) / MOST_ERROR
+    def secrets(self, memory: TaskMemory) -> list[Float32[Tensor, "B F"]]:
+        return [log_gain(memory.more["gain"]).flatten(1)]
+
+    def own_reward(
+        self, memory: TaskMemory, world: World
+    ) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
+        return memory, -self.cost(memory, world) / MOST_ERROR
+
+
+class ScheduleHard(Schedule):
+    """``schedule-v0`` in three dimensions: UAVs roam over two walls of 12 m, which hide anchors."""
+
+    name = "schedule-hard-v0"
+    hard = True

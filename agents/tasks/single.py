@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from agents.tasks.registry import make_task
-from agents.tasks.task import Seen, Task
+from agents.tasks.faces import built
+from agents.tasks.rules import Seen
+from agents.tasks.task import Task
 from coloc_env.envs.actions import ModeRunner, action_space, checked_arrays, checked_tensor
 from coloc_env.observation import flat_box
 from coloc_env.seeding import checked_seed, random_seed
@@ -15,8 +16,8 @@ from coloc_env.world import World
 
 
 class SingleAgentTask(gym.Env[np.ndarray, Any]):
-    """``uav_0`` of a task, by name or built; ``others``: the heuristic for the rest (None:
-    the best that is known).
+    """``uav_0`` of a task, by name, with its options, or built; ``others``: the heuristic for the
+    rest (None: the best that is known).
 
     Observations are flat float32 [F] within [−1, 1]; where actions are choices, infos have their
     ``action_mask`` [choices] int8. The horizon truncates. Raises ValueError for an unknown policy.
@@ -24,8 +25,10 @@ class SingleAgentTask(gym.Env[np.ndarray, Any]):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's convention)
 
-    def __init__(self, task: str | Task, others: str | None = None) -> None:
-        self.task = make_task(task) if isinstance(task, str) else task
+    def __init__(self, task: str | Task, others: str | None = None, **options: Any) -> None:
+        self.task = built(task, options)
+        if not self.task.flat:
+            raise ValueError(f"{self.task.name}: obs='dict' is not allowed here: flat")
         self.others = self.task.policy(others or self.task.best)
         self.world = World(self.task.scenario)
         self._runner = ModeRunner(self.task, self.world)

@@ -6,25 +6,20 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.tasks.task import (
-    ESTIMATOR,
-    MOST_ERROR,
-    Seen,
-    Task,
-    TaskMemory,
-    idle,
-    random_policy,
-    sensors,
-    task_scenario,
-    towards,
-)
-from coloc_env.motion import Arena, Groups, RandomWalk, Steered
+from agents.tasks.cem import OthersKnown
+from agents.tasks.memory import TaskMemory
+from agents.tasks.options import Drift, SteeredTaskOptions
+from agents.tasks.rules import Seen, idle, random_policy, towards
+from agents.tasks.space import Space
+from agents.tasks.task import MOST_ERROR, Task, sensors, task_scenario
+from coloc_env.motion import Groups, RandomWalk
 from coloc_env.network import Network
 from coloc_env.options import PositiveCount
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
-_SIDE, _RADIUS, _V_MAX = 100.0, 30.0, 3.0
+_SIDE, _RADIUS, _V_MAX, _A_MAX = 100.0, 30.0, 3.0, 1.5
+_WALLS = (((42.0, 10.0), (45.0, 50.0)), ((42.0, 70.0), (45.0, 95.0)))
 
 
 def nearest(seen: Seen) -> Tensor:
@@ -46,7 +41,7 @@ def pairs(seen: Seen) -> Tensor:
     come from two sides, so that their ranges cross."""
     n, b = seen.task.n_agents, len(seen.position)
     sigma = seen.sigma[:, n:].clone()
-    own, target = seen.position[:, :n], seen.position[:, n:]
+    own, target = seen.plane[:, :n], seen.plane[:, n:]
     goals = []
     for first in range(0, n, 2):
         members = own[:, first : first + 2]
@@ -77,6 +72,8 @@ class Track(Task):
     ``drift``: odometry's noise, m/√m.
     """
 
+    name = "track-v0"
+    shared = True
     policies: ClassVar = {
         "random": random_policy,
         "idle": idle,
@@ -84,6 +81,7 @@ class Track(Task):
         "worst": worst,
         "pairs": pairs,
     }
+    planners: ClassVar = {"cem": OthersKnown}
     best = "pairs"
 
     def __init__(
@@ -92,25 +90,38 @@ class Track(Task):
         n_uavs: PositiveCount = 4,
         targets: PositiveCount = 3,
         horizon: PositiveCount = 100,
-        drift: float = 0.3,
-        estimator: str = ESTIMATOR,
+        drift: Drift = 0.3,
+        task: SteeredTaskOptions = SteeredTaskOptions(),
     ) -> None:
-        total = n_uavs + targets
-        steered = Steered("velocity", _V_MAX, 1.5, ((10.0, 10.0), (40.0, 40.0)))
-        walk = RandomWalk(1.0, ((20.0, 20.0), (80.0, 80.0)))
+        total, space = n_uavs + targets, Space((_SIDE, _SIDE), self.hard, _WALLS)
+        start = space.start((10.0, 10.0), (40.0, 40.0))
+        steered = task.steered(_V_MAX, _A_MAX, start, space)
+        first = (50.0, 20.0) if self.hard else (20.0, 20.0)  # m: not inside a wall
+        walk = RandomWalk(1.0, space.start(first, (80.0, 80.0)), space.walls)
+        anchors = space.anchors(((10.0, 10.0), (30.0, 10.0)))
         scenario = task_scenario(
-            "track-v0",
-            sensors(((10.0, 10.0), (30.0, 10.0)), 0.02, drift, _RADIUS, blind=targets),
-            arena=Arena(2, total, 1.0, (0.0, 0.0), (_SIDE, _SIDE)),
+            self.name,
+            sensors(anchors, 0.02, drift, _RADIUS, space.walls, blind=targets),
+            arena=space.arena(total),
             horizon=horizon,
             motion=Groups(((steered, n_uavs), (walk, targets))),
-            network=Network(radius=_RADIUS, max_neighbours=max(16, total)),
+            network=Network(_RADIUS, space.walls, max_neighbours=max(16, total)),
             prior=Prior(0.5, target_std=4.0),
             targets=targets,
         )
-        super().__init__(scenario, n_uavs, estimator, _RADIUS, _V_MAX)
+        super().__init__(scenario, n_uavs, task, _RADIUS, _V_MAX, _A_MAX)
 
-    def reward(self, memory: TaskMemory, world: World) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
-        error = self.error(memory, world)[:, self.n_agents :]
+    def own_reward(
+        self, memory: TaskMemory, world: World
+    ) -> tuple[TaskMemory, Float32[Tensor, "B n"]]:
+        error = self.cost(memory, world)[:, self.n_agents :]
         team = -error.mean(-1, keepdim=True) / MOST_ERROR
         return memory, team.expand(-1, self.n_agents)
+
+
+class TrackHard(Track):
+    """``track-v0`` in three dimensions, 20 m high, where two walls of 12 m are between the anchors
+    and the targets; anchors are on masts."""
+
+    name = "track-hard-v0"
+    hard = True

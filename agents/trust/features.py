@@ -32,8 +32,11 @@ class Innovation:
     seen: Float[Tensor, "B N m"]
 
 
-def innovation(block: Block, covariance: Float[Tensor, "B N E E"]) -> Innovation:
-    """Of a block linearized at the prior with error covariance ``covariance``."""
+def innovation(
+    block: Block, covariance: Float[Tensor, "B N E E"], relative: bool = False
+) -> Innovation:
+    """Of a block linearized at the prior with error covariance ``covariance``; ``relative``: shares
+    of variances by component, where these have other units."""
     h, r, noise = block.jacobian, block.residual, block.total_variance
     spread = h @ covariance.unsqueeze(-3) @ h.mT
     s = spread + torch.diag_embed(noise)
@@ -44,10 +47,15 @@ def innovation(block: Block, covariance: Float[Tensor, "B N E E"]) -> Innovation
     else:
         distance = (r * torch.linalg.solve(s, r)).sum(-1)
         sign = torch.zeros_like(distance)
-    prior_share = spread.diagonal(dim1=-2, dim2=-1).sum(-1) / noise.sum(-1)
+    predicted, theirs = spread.diagonal(dim1=-2, dim2=-1), block.partner_variance
     partner = torch.zeros_like(distance)
-    if block.partner_variance is not None:
-        partner = torch.log1p(block.partner_variance.sum(-1) / block.variance.sum(-1))
+    if relative:
+        prior_share = (predicted / noise).mean(-1)
+        partner = partner if theirs is None else (theirs / block.variance).mean(-1).log1p()
+    else:
+        prior_share = predicted.sum(-1) / noise.sum(-1)
+        if theirs is not None:
+            partner = torch.log1p(theirs.sum(-1) / block.variance.sum(-1))
     return Innovation(
         innovation=torch.log1p(distance.clamp(0, _FAR) / k),
         sign=sign,
@@ -63,11 +71,13 @@ def features(
     own_std: Float[Tensor, "B N"],
     counts: Sequence[Float[Tensor, "B N"]],
     memory: Float[Tensor, "B N m 3"],
+    relative: bool = False,
 ) -> Float[Tensor, "B N m 15"]:
     """``SHARED`` and ``SIGNED`` features of a block whose residuals are those after a Huber update.
 
     ``own_std``: log of the position's prior standard deviation; ``counts``: log(1 + number) of
-    vector measurements and of ranges seen, and the running mean of the former.
+    vector measurements and of ranges seen, and the running mean of the former. ``relative``:
+    ``own_std`` becomes the log of its ratio to the noise of the measured length.
     """
     r, noise = block.residual, block.total_variance
     scaled = r / noise.sqrt()
@@ -77,6 +87,8 @@ def features(
     link, sign, seen = memory.unbind(-1)
     block_mean = (link * seen).sum(-1) / seen.sum(-1).clamp_min(1e-3)
     wide = [x.unsqueeze(-1).expand_as(residual) for x in (own_std, *counts, block_mean)]
+    if relative:  # the first component of every judged measurement is a length
+        wide[0] = wide[0] - 0.5 * block.variance[..., 0].log()
     return torch.stack(
         (
             first.innovation,

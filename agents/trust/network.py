@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -28,6 +29,11 @@ SIGNED = (
     "signed_residual",  # asinh of the residual after a Huber update, over its noise
     "link_sign",  # running mean of ``signed_innovation`` on this link
 )
+RELATIVE = ("relative_std", "relative_doubt", "relative_partner")
+"""What stands for ``own_std``, ``doubt`` and ``partner`` in networks without units: log of the
+position's prior standard deviation over the noise's, and the other two by component, so that metres
+and radians are never added."""
+_ABSOLUTE = SHARED[2:5]
 _AT_FIRST = math.log(0.98 / 0.02)  # the trust's logit before training
 
 
@@ -43,13 +49,21 @@ class TrustNetwork(Learned):
 
     A vector measurement (landmark, bearing) gets a weight in [0, 1]; a range a weight and a bias
     ≥ 0 in standard deviations of its noise. Some 3 300 weights; untrained it trusts nearly all.
+    ``relative``: its features are free of units (``RELATIVE``); the first trainings' are not.
     """
 
     kind = "trust"
-    features = SHARED + SIGNED
+    features: tuple[str, ...] = SHARED + SIGNED
 
-    def __init__(self) -> None:
+    def __init__(self, relative: bool = False) -> None:
         super().__init__()
+        self.relative = relative
+        if relative:
+            self.architecture = {"relative": True}
+            self.features = tuple(
+                dict(zip(_ABSOLUTE, RELATIVE, strict=True)).get(name, name)
+                for name in SHARED + SIGNED
+            )
         self.vectors = _layers(len(SHARED), 1)
         self.ranges = _layers(len(SHARED) + len(SIGNED), 2)
 
@@ -63,3 +77,17 @@ class TrustNetwork(Learned):
         """Weights of ranges, and biases over the noise's standard deviation."""
         weight, bias = self.ranges(features).unbind(-1)
         return sigmoid(_AT_FIRST + weight), softplus(bias - 4.0)
+
+    @classmethod
+    def relative_to(cls, other: "TrustNetwork", vectors: float, ranges: float) -> "TrustNetwork":
+        """A network with relative features that judges as ``other``, one without, does where
+        vectors and ranges have noise of these standard deviations (m): what was log s is
+        log(s / σ) + log σ."""
+        made = cls(relative=True)
+        made.load_state_dict(other.state_dict())
+        with torch.no_grad():
+            for layers, std in ((made.vectors, vectors), (made.ranges, ranges)):
+                first = layers[0]
+                assert isinstance(first, nn.Linear)
+                first.bias.add_(first.weight[:, SHARED.index("own_std")], alpha=math.log(std))
+        return made

@@ -80,7 +80,8 @@ class TrustScreen(Screen):
         before, *parts = prediction.memory.to(prediction.state.dtype).split(
             [1, *(MEMORY * block.mask.shape[-1] for block in judged)], -1
         )
-        first = [innovation(block, prediction.covariance) for block in judged]
+        relative = self.network.relative
+        first = [innovation(block, prediction.covariance, relative) for block in judged]
         totals = torch.zeros(2, *prediction.state.shape[:2], dtype=prediction.state.dtype)
         totals = totals.to(prediction.state.device)
         for i, one in zip(self.judged, first, strict=True):
@@ -101,7 +102,9 @@ class TrustScreen(Screen):
         trusts = [Trust()] * len(blocks)
         for i, first, memory in zip(self.judged, evidence.first, evidence.memory, strict=True):
             block = blocks[i]
-            seen = features(block, first, evidence.own_std, evidence.counts, memory)
+            seen = features(
+                block, first, evidence.own_std, evidence.counts, memory, self.network.relative
+            )
             # Behind a mask may be anything; the networks must not see it.
             seen = seen.detach().to(torch.float32).masked_fill(~block.mask.unsqueeze(-1), 0.0)
             if i in self.ranges:
@@ -124,9 +127,17 @@ class TrustScreen(Screen):
 
 
 def learned_screen(
-    process: Process, models: Sequence[Measurement], weights: str, options: dict[str, Any]
+    process: Process,
+    models: Sequence[Measurement],
+    weights: str,
+    bank: bool,
+    options: dict[str, Any],
 ) -> TrustScreen:
-    """The screen that judges by a checkpoint's networks, and by nothing beside them."""
+    """The screen that judges by a checkpoint's networks, and by nothing beside them; ``auto``:
+    those trained for a ``bank``, or for use alone."""
     if options.get("robust", "none") != "none":
         raise ValueError("robust is not allowed beside learned trust: none")
-    return TrustScreen(process, models, learned(TrustNetwork, weights).requires_grad_(False))
+    if weights == "auto":
+        weights = "trust_bank" if bank else "trust"
+    network = learned(TrustNetwork, weights).requires_grad_(False)
+    return TrustScreen(process, models, network)

@@ -16,6 +16,7 @@ from torch import Tensor
 from coloc_env.bounds.mixture import EXACT
 from coloc_env.geometry import cross_matrix, rotation_between, rotation_matrix, unrotate
 from coloc_env.motion import Kinematics
+from coloc_env.observation import Observation
 from coloc_env.scenario import (
     ConstantVelocity,
     DisplacementDriven,
@@ -44,8 +45,8 @@ class ErrorModel(ABC):
         """Standard deviations [E] at step 0, given those of the position (m, per axis)."""
 
     @abstractmethod
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
-        """F and Q of the step from ``before`` to ``now``."""
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
+        """F and Q of the step from ``before`` to ``now``, which ends with what is ``seen``."""
 
     @abstractmethod
     def pose(self) -> Float64[Tensor, "D E"]:
@@ -69,12 +70,15 @@ class InertialErrors(ErrorModel):
         biases = [*3 * [self.imu.accel_bias], *3 * [self.imu.gyro_bias]]
         return motion + biases * self.biased
 
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
         gravity = now.velocity.new_tensor((0.0, 0.0, GRAVITY))
         force = unrotate(before.attitude, (now.velocity - before.velocity) / self.dt + gravity)
         turn = rotation_between(before.attitude, now.attitude)
         f, g = strapdown_jacobians(rotation_matrix(before.attitude), force, turn, self.dt)
-        noise = g * g.new_tensor(3 * [self.imu.accel_std] + 3 * [self.imu.gyro_std])
+        std = g.new_tensor((self.imu.accel_std, self.imu.gyro_std))
+        if "imu_unknown" in seen:  # samples are missing
+            std = torch.hypot(std, seen["imu_unknown"].double())
+        noise = g * std.repeat_interleave(3, -1).unsqueeze(-2)
         q = noise @ noise.mT
         if not self.biased:
             return f, q
@@ -95,7 +99,7 @@ class WheeledErrors(ErrorModel):
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
         return [*position, prior.attitude_std]
 
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
         rotation = rotation_matrix(before.attitude)
         moved = now.position - before.position
         f = torch.eye(3, dtype=moved.dtype, device=moved.device).repeat(*moved.shape[:2], 1, 1)
@@ -104,7 +108,10 @@ class WheeledErrors(ErrorModel):
         sample = torch.cat((unrotate(before.attitude, moved), turned), -1) / self.dt
         noise = torch.zeros_like(f)
         noise[..., :2, :2], noise[..., 2, 2] = rotation, 1.0
-        noise = noise * (self.odometry.std(sample) * self.dt).unsqueeze(-2)
+        std = self.odometry.std(sample)
+        if "odometry_unknown" in seen:
+            std = torch.hypot(std, seen["odometry_unknown"].double())
+        noise = noise * (std * self.dt).unsqueeze(-2)
         return f, noise @ noise.mT
 
     def pose(self) -> Float64[Tensor, "D E"]:
@@ -124,7 +131,7 @@ class InsErrors(ErrorModel):
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
         return [*position, *self.dim * [self.ins.bias]] if self.ins.bias else position
 
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
         kept = math.exp(-self.dt / self.ins.bias_time)
         white, fresh = (self.ins.std * self.dt) ** 2, (1 - kept**2) * self.ins.bias**2
         if self.ins.bias:
@@ -157,7 +164,7 @@ class DisplacementErrors(ErrorModel):
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
         return position
 
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
         variance = self.sensor.variance((now.position - before.position).norm(dim=-1))
         eye = torch.eye(self.dim).to(now.position)
         q = variance[..., None, None] * eye
@@ -178,7 +185,7 @@ class ConstantVelocityErrors(ErrorModel):
     def prior_std(self, prior: Prior, position: list[float]) -> list[float]:
         return [*position, *self.dim * [prior.velocity_spread]]
 
-    def transition(self, before: Kinematics, now: Kinematics) -> Jacobians:
+    def transition(self, before: Kinematics, now: Kinematics, seen: Observation) -> Jacobians:
         rate = 1 / self.process.damping if self.process.damping else 0.0
         system = torch.tensor(((0.0, 1.0), (0.0, -rate)), dtype=torch.float64)
         drive = torch.tensor(((0.0, 0.0), (0.0, self.process.accel_std**2)), dtype=torch.float64)

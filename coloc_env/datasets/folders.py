@@ -22,7 +22,15 @@ _FOLDERS = {  # where not the name
     "tiers": "tiers_mrs",
     "murp": "murp/parsed",
 }
-_READ = (".csv", ".dat", ".npz", ".txt", ".yaml")  # suffixes of files that loaders read
+_READ = (
+    ".csv",
+    ".dat",
+    ".npz",
+    ".parquet",
+    ".tum",
+    ".txt",
+    ".yaml",
+)  # suffixes of files that loaders read
 Version = tuple[tuple[str, int, int], ...]
 
 

@@ -34,6 +34,8 @@ class Track:
         gyro_bias: [T, 3] rad/s in the body frame, None where the recording has none.
         accel_bias: [T, 3] m/s^2 in the body frame, None where the recording has none.
 
+    A robot of which nothing is known has a track without samples (``Track.unknown``).
+
     Raises:
         ValueError: shapes that do not agree, times that do not increase, or a position that is not
             finite or farther than 10 000 km from the origin.
@@ -45,6 +47,12 @@ class Track:
     velocity: Floats | None = None
     gyro_bias: Floats | None = None
     accel_bias: Floats | None = None
+
+    @classmethod
+    def unknown(cls, dim: int) -> "Track":
+        """The track of a robot in ``dim`` dimensions without ground truth."""
+        attitude = np.empty((0, 1 if dim == 2 else 4))
+        return cls(np.empty(0, np.int64), np.empty((0, dim)), attitude)
 
     def __post_init__(self) -> None:
         steps, dim = self.position.shape
@@ -93,13 +101,18 @@ class Recording:
     Streams, with the columns of their tables (a recording has those it can fill):
 
     - ``imu``: gyro_x … gyro_z rad/s, accel_x … accel_z specific force m/s^2; forward-left-up body
-    - ``odometry``: v m/s, omega rad/s; as commanded, valid until the next sample
+    - ``odometry``: v m/s, omega rad/s, or vx, vy, omega of a vehicle that also moves sideways; as
+      commanded, valid until the next sample
     - ``landmark_bearings``: landmark (index), range m, bearing rad (counter-clockwise)
     - ``uav_bearings``: robot (index), range m, bearing rad
     - ``uav_ranges``: own_tag, robot, tag (indices), range m; each exchange in both ends' tables
     - ``anchor_ranges``: own_tag, anchor (indices), range m
     - ``height``: height m above the world's origin
     - ``magnetometer``: x, y, z tesla, body frame
+    - ``landmark_vectors``, ``uav_vectors``: landmark or robot (index), x, y, z m in the body frame
+    - ``position_fix``: x, y, z m in the world frame
+    - ``relative_poses``: robot (index), its x, y, z m and quaternion wxyz (in the plane x, y and
+      heading rad) in the body frame
 
     Attributes:
         name: dataset and sequence.
@@ -116,6 +129,12 @@ class Recording:
             recorded.
         dropped: stream name to how many of its measurements were left out, since the sensor cannot
             have given them: not finite, not positive, or beyond its reach.
+        landmark_names, anchor_names: L and A names (default: ``landmark_0``, ``anchor_0``, …).
+        epoch: ns since 1970 at time zero; 0 where that is not known.
+        points: tables of x, y[, z] m, one a robot: places where it was at known times, beside or
+            instead of truth; empty without any.
+        start: [N, d + a] position and attitude at the start as far as known without truth, NaN
+            where not; empty without any.
 
     Raises:
         ValueError: shapes or numbers of robots that do not agree, or a place that is not finite.
@@ -132,10 +151,28 @@ class Recording:
     source: str
     origin: tuple[float, ...] = ()
     dropped: Mapping[str, int] = field(default_factory=dict)
+    landmark_names: tuple[str, ...] = ()
+    anchor_names: tuple[str, ...] = ()
+    epoch: int = 0
+    points: tuple[Table, ...] = ()
+    start: Floats = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def tracked(self) -> bool:
+        """Whether every robot has ground truth."""
+        return all(len(track.time) for track in self.truth)
 
     def __post_init__(self) -> None:
         robots = len(self.robots)
-        for what, tables in {"truth": self.truth, **self.streams}.items():
+        for what in ("landmark", "anchor"):
+            places, names = getattr(self, f"{what}s"), getattr(self, f"{what}_names")
+            if not names:
+                names = tuple(f"{what}_{i}" for i in range(len(places)))
+                object.__setattr__(self, f"{what}_names", names)
+            if len(names) != len(places):
+                raise ValueError(f"Recording.{what}_names are {len(names)}, not {len(places)}")
+        marked = {"points": self.points} if self.points else {}
+        for what, tables in {"truth": self.truth, **self.streams, **marked}.items():
             if len(tables) != robots:
                 raise ValueError(f"Recording.{what} holds {len(tables)} robots, not {robots}")
         if any(track.position.shape[1] != self.dim for track in self.truth):
@@ -154,26 +191,39 @@ def plausible(distance: Floats, most: float) -> Flags:
 
 
 def near_origin(recording: Recording) -> Recording:
-    """The recording about an origin of its own, the middle of its truth to the kilometre, so that
-    float32 has digits enough; unchanged where that is within half a kilometre of the origin."""
-    places = np.concatenate([track.position for track in recording.truth])
+    """The recording about an origin of its own, the middle of its truth (without any: of its map)
+    to the kilometre, so that float32 has digits enough; unchanged where that is within half a
+    kilometre of the origin."""
+    known = [track.position for track in recording.truth if len(track.time)]
+    places = np.concatenate(known or [recording.landmarks, recording.anchors])
+    if not len(places):
+        return recording
     middle = 0.5 * (places.min(0) + places.max(0))
     origin = 1000.0 * np.round(middle / 1000.0)
     if not origin.any():
         return recording
-    streams = dict(recording.streams)
-    if recording.dim == 3 and "height" in streams:
-        streams["height"] = tuple(
-            replace(table, values=table.values - origin[2]) for table in streams["height"]
-        )
+    dim, streams = recording.dim, dict(recording.streams)
+    moved = {"position_fix": origin} | ({"height": origin[2]} if dim == 3 else {})
+    for name in moved.keys() & streams.keys():
+        streams[name] = _shifted(streams[name], moved[name])
+    start = recording.start.copy()
+    if len(start):
+        start[:, :dim] -= origin
+    before = np.array(recording.origin or (0.0,) * dim)
     return replace(
         recording,
         truth=tuple(replace(track, position=track.position - origin) for track in recording.truth),
         streams=streams,
         landmarks=recording.landmarks - origin,
         anchors=recording.anchors - origin,
-        origin=tuple(origin.tolist()),
+        origin=tuple((origin + before).tolist()),
+        points=_shifted(recording.points, origin),
+        start=start,
     )
+
+
+def _shifted(tables: tuple[Table, ...], origin: Floats) -> tuple[Table, ...]:
+    return tuple(replace(table, values=table.values - origin) for table in tables)
 
 
 def check_places(what: str, places: Floats) -> None:

@@ -7,6 +7,7 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -15,9 +16,10 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from coloc_env.commands import Commands
+from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import Observation, action_bounds, all_leaves, box, state_bounds
 from coloc_env.scenario import Believed, Scenario
+from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Leaf
 from coloc_env.world import Step, World
 
@@ -32,14 +34,16 @@ class ActionMode(ABC):
     there is nothing). In each step first ``observe``, then ``estimate`` is called. ``leaves`` are
     what the mode adds to each UAV's observation, ``features`` those that a policy should read,
     ``meaning`` the words for an action in error messages. ``choices``: actions are one of so many
-    (None: numbers within ``bounds``). ``whole``: its leaf ``observation`` is all that agents see, a
-    flat vector within its bounds, with their ``action_mask`` where actions are choices.
+    (None: numbers within ``bounds``). ``whole``: its leaves are all that agents see, with their
+    ``action_mask`` where actions are choices: one flat vector ``observation`` where it is ``flat``,
+    else a Dict.
     ``rewards``: rewards are its own, of what is estimated after the step.
     """
 
     name: str
     choices: int | None = None
     whole: bool = False
+    flat: bool = True
     meaning: str
     rewards: bool = False
     features: tuple[str, ...] = ()
@@ -58,12 +62,12 @@ class ActionMode(ABC):
         """Lowest and highest numbers of one UAV's action: ±1 for each axis."""
         return [-1.0] * self.dim, [1.0] * self.dim
 
-    @property
+    @cached_property
     def width(self) -> int:
         """How many numbers one UAV's action has."""
         return 1 if self.choices else len(self.bounds[0])
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Shape of one UAV's action."""
         return () if self.choices else (self.width,)
@@ -106,11 +110,30 @@ class ActionMode(ABC):
         """The position (m) that actions are relative to; None where they are not."""
         return None
 
+    def state(self, memory: Any, world: World) -> Float32[Tensor, "B S"]:
+        """What a critic may know: the truth, and the error in m of what actions are relative to,
+        if they are."""
+        truth, reference = world.state(), self.reference(memory)
+        if reference is None:
+            return truth
+        error = (reference - world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
+        return torch.cat((truth, error.flatten(-2)), -1)
+
+    def state_bounds(self, scenario: Scenario) -> tuple[list[float], list[float]]:
+        """Bounds of the flat state."""
+        low, high = state_bounds(scenario)
+        if type(self).reference is not ActionMode.reference:
+            more = scenario.arena.n_uavs * self.dim
+            low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
+        return low, high
+
 
 class Estimates(ActionMode):
     """The estimate itself, as localizers give it (values beyond ``bounds`` are scored as well).
 
-    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame).
+    Where motion is steered, the command for the step to come follows (m/s or m/s², world frame);
+    where links are decided upon, the call in that step, to the nearest whole number: −1 for none, a
+    UAV's number or N + m for anchor m where they are chosen, 0 to speak where they are broadcast.
     """
 
     name = "estimate"
@@ -118,23 +141,30 @@ class Estimates(ActionMode):
 
     def __init__(self, believed: Believed) -> None:
         super().__init__(believed)
-        self.largest = believed.largest_command
-        if self.largest:
-            self.meaning = "[position, velocity, log-std, command]"
+        self.largest, self.calls = believed.largest_command, believed.links != "all"
+        self.last = 0  # call
+        if believed.links == "chosen":
+            anchors = believed.sensor(AnchorRanging)
+            self.last = believed.arena.n_uavs + (len(anchors.anchors) if anchors else 0) - 1
+        command = ", command" if self.largest else ""
+        self.meaning = f"[position, velocity, log-std{command}{', call' if self.calls else ''}]"
 
     @property
     def bounds(self) -> tuple[list[float], list[float]]:
         low, high = action_bounds(self.believed.arena)
         more = [self.largest] * self.dim if self.largest else []
-        return low + [-x for x in more], high + more
+        calls = [float(self.last)] if self.calls else []
+        return low + [-x for x in more] + [-1.0 for _ in calls], high + more + calls
 
     def estimate(
         self, memory: None, action: Float32[Tensor, "B N A"]
     ) -> tuple[None, Float32[Tensor, "B N A"]]:
-        return None, action[..., : 3 * self.dim]
+        return None, action[..., : 3 * self.dim] if self.largest or self.calls else action
 
     def commands(self, memory: None, action: Float32[Tensor, "B N A"]) -> Commands:
-        return Commands(action[..., 3 * self.dim :] if self.largest else None)
+        d = self.dim
+        calls = action[..., -1].round().clamp(SILENT, self.last).long() if self.calls else None
+        return Commands(action[..., 3 * d : 4 * d] if self.largest else None, calls)
 
 
 class ModeRunner:
@@ -204,13 +234,8 @@ class ModeRunner:
         return self._memory
 
     def state(self) -> Float32[Tensor, "B S"]:
-        """What a critic may know: the truth, and the error in m of what actions are relative to,
-        if they are."""
-        truth, reference = self.world.state(), self.mode.reference(self._memory)
-        if reference is None:
-            return truth
-        error = (reference - self.world.now.target).clamp(-MAX_STATE_ERROR, MAX_STATE_ERROR)
-        return torch.cat((truth, error.flatten(-2)), -1)
+        """What a critic may know."""
+        return self.mode.state(self._memory, self.world)
 
 
 def action_space(mode: ActionMode) -> gym.spaces.Space[Any]:
@@ -250,22 +275,14 @@ def chosen_leaves(
     all. ValueError for one that does not exist, and where UAVs can fail: rows of one world then do
     not end together."""
     known = observed_leaves(scenario, mode)
-    names = tuple(wanted or (("observation",) if mode.whole else mode.features or known))
+    own = [name for name in known if name != "action_mask"]
+    names = tuple(wanted or (own if mode.whole else mode.features or known))
     for name in names:
         if name not in known:
             raise ValueError(f"there is no leaf {name!r}; known: {', '.join(known)}")
     if scenario.failure_rate or scenario.failures:
         raise ValueError(f"{scenario.name}: UAVs that fail do not fit rows of one UAV each")
     return {name: known[name] for name in names}
-
-
-def privileged_bounds(scenario: Scenario, mode: ActionMode) -> tuple[list[float], list[float]]:
-    """Bounds of the flat state: the truth's, and those of the error that goes with the mode."""
-    low, high = state_bounds(scenario)
-    if type(mode).reference is not ActionMode.reference:
-        more = scenario.arena.n_uavs * mode.dim
-        low, high = low + [-MAX_STATE_ERROR] * more, high + [MAX_STATE_ERROR] * more
-    return low, high
 
 
 # ------------------------------------------------------------------ checks of actions

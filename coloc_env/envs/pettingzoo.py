@@ -19,7 +19,6 @@ from coloc_env.envs.actions import (
     checked_arrays,
     make_mode,
     observed_leaves,
-    privileged_bounds,
 )
 from coloc_env.observation import all_leaves, box, flat_box, observation_space
 from coloc_env.render import Renderer
@@ -75,14 +74,13 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self._runner = ModeRunner(self.mode, self.world)
         seen = observed_leaves(scenario, self.mode)
         space: gym.spaces.Space[Any] = observation_space(seen)
-        if self.mode.whole:
+        if self.mode.whole and self.mode.flat:
             space = flat_box({"observation": seen["observation"]})
         actions = action_space(self.mode)
         self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = dict.fromkeys(self.possible_agents, actions)
-        self.state_space = box(privileged_bounds(scenario, self.mode))
+        self.state_space = box(self.mode.state_bounds(scenario))
         self._next_seed: int | None = None
-        self._names = tuple(all_leaves(scenario))
         self._can_fail = bool(scenario.failure_rate or scenario.failures)
         self._window: _Window
         self._renderer = None if render_mode is None else Renderer(scenario)
@@ -110,7 +108,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.seed = checked_seed(seed, self.scenario.name)
         self._next_seed = self.seed + 1
         self.agents = list(self.possible_agents)
-        self.world.reset([self.seed])
+        self.world.restart([self.seed])
         self._window = _Window(self.world)
         self._tallies = {agent: _Tally(self.seed) for agent in self.agents}
         if self._renderer is not None:
@@ -194,7 +192,7 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         if len(agents) < count:
             acting, stacked = stacked, np.zeros((count, *self.mode.shape), np.float32)
             stacked[[self._index[a] for a in agents]] = acting
-        return torch.from_numpy(stacked).unsqueeze(0)
+        return torch.from_numpy(stacked[None])
 
     def _masked(self, infos: dict[str, Any], leaves: Leaves) -> dict[str, Any]:
         """Infos with ``action_mask`` [choices] int8, where actions are choices."""
@@ -212,31 +210,39 @@ class CoLocParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def _observe(self, leaves: Leaves) -> dict[str, Any]:
         """Each agent's leaves, ``leaves`` of the action mode included: rows of copies that nobody
         else has."""
-        world = self.world
-        if world.sensed is not self._window.sensed:
-            self._window = _Window(world)
-        if self.mode.whole:
+        world, window = self.world, self._window
+        if world.sensed is not window.sensed:
+            self._window = window = _Window(world)
+        if self.mode.whole and self.mode.flat:
             return self._of(list(leaves["observation"].numpy()[0]))
-        messages, heard = world.messages()
-        now = [leaf[world.cursor] for leaf in self._window.leaves]
-        static = [leaf[world.cursor] for leaf in self._window.static]
-        more = [leaf.numpy()[0] for leaf in leaves.values()]
-        names = (*self._names, *leaves)
-        rows = zip(*now, messages.numpy()[0], heard.numpy()[0], *static, *more, strict=True)
-        return self._of([dict(zip(names, row, strict=True)) for row in rows])
+        if self.mode.whole:
+            parts = zip(*(leaf.numpy()[0] for leaf in leaves.values()), strict=True)
+            return self._of([dict(zip(leaves, each, strict=True)) for each in parts])
+        k = world.cursor
+        now = [leaf[k] for leaf in window.leaves]
+        now[window.messages_at] = world.messages().numpy()[0]
+        names = window.names
+        if leaves:
+            now += [leaf.numpy()[0] for leaf in leaves.values()]
+            names = (*names, *leaves)
+        return self._of([dict(zip(names, row)) for row in zip(*now, strict=True)])  # noqa: B905
 
 
 class _Window:
-    """A window of the one world as arrays and lists [K, …], copied once."""
+    """A window of the one world as arrays and lists [K, …], copied once; leaves in the order of the
+    spaces, with room for the messages, which no window has."""
 
     def __init__(self, world: World) -> None:
         self.sensed = sensed = world.sensed
         self.over: list[bool] = sensed.over.tolist()[0]
         self.scored: list[list[bool]] = sensed.scored.tolist()[0]
         self.failed = sensed.failed.numpy()[0]
-        self.leaves = [leaf.numpy()[0].copy() for leaf in sensed.leaves.values()]
         each = (sensed.count, 1, 1)
-        self.static = [np.tile(leaf.numpy(), each) for leaf in world.static.values()]
+        leaves = {name: leaf.numpy()[0].copy() for name, leaf in sensed.leaves.items()}
+        leaves |= {name: np.tile(leaf.numpy(), each) for name, leaf in world.static.items()}
+        self.names = tuple(all_leaves(world.scenario))
+        self.messages_at = self.names.index("messages")
+        self.leaves = [leaves.get(name, self.over) for name in self.names]
 
 
 class _Tally:
@@ -269,9 +275,12 @@ class _Tally:
 class _Cycle(parallel_to_aec_wrapper):
     """PettingZoo's agent-environment cycle, each observation of which is a copy."""
 
-    def observe(self, agent: str) -> dict[str, np.ndarray]:
+    def observe(self, agent: str) -> Any:
         """What the agent observes until all have acted."""
-        return {name: leaf.copy() for name, leaf in super().observe(agent).items()}
+        seen = super().observe(agent)
+        if isinstance(seen, dict):
+            return {name: leaf.copy() for name, leaf in seen.items()}
+        return seen.copy()
 
 
 def parallel_env(

@@ -109,7 +109,7 @@ class CoLocVecEnv(VecEnv):
         return [self._next_seed + sub_env.world for sub_env in self.sub_envs]
 
     def reset(self) -> Array:
-        self.world.reset(self._next_seed)
+        self.world.restart(self._next_seed)
         self._next_seed += self.worlds
         seeds = self.world.seeds.tolist()
         self.reset_infos = [{"seed": seeds[sub_env.world]} for sub_env in self.sub_envs]

@@ -17,13 +17,14 @@ from coloc_env.envs.actions import (
     chosen_leaves,
     make_mode,
     observed_leaves,
-    privileged_bounds,
 )
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from
 from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.sensing import Sensed
-from coloc_env.world import World
+from coloc_env.world import World, steps_ahead
+
+_LONGEST = 128  # steps sensed ahead at most: rollouts are short beside episodes
 
 
 class CoLocEnv(EnvBase):
@@ -33,7 +34,7 @@ class CoLocEnv(EnvBase):
     ``("uav", "reward")`` [B, N, 1], ``("uav", "mask")`` [B, N] (UAVs that have not failed),
     ``state`` [B, S] (privileged truth, and the error of what actions are relative to) and root
     ``done``, ``terminated``, ``truncated`` [B, 1]: an episode ends at its horizon, by truncation;
-    a world in which every UAV failed terminates.
+    a world in which every UAV failed terminates. ``group_map`` names the one group.
 
     Row b of the first episode is the world of seed ``seed + b``, of the next one
     ``seed + b + num_envs``, and so on: the same worlds as the PettingZoo face's. Without ``seed``
@@ -55,8 +56,9 @@ class CoLocEnv(EnvBase):
         scenario = scenario_from(scenario, overrides)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.scenario = scenario
-        self.world = World(scenario, num_envs, device)
+        self.world = World(scenario, num_envs, device, steps_ahead(scenario, num_envs, _LONGEST))
         self.mode = make_mode(scenario, action)
+        self.group_map = {"uav": scenario.agents[: self.mode.n_agents]}
         self._runner = ModeRunner(self.mode, self.world)
         self._sensed: Sensed | None = None
         self._set_seed(random_seed() if seed is None else seed)
@@ -71,10 +73,11 @@ class CoLocEnv(EnvBase):
             for name, leaf in observed_leaves(self.scenario, self.mode).items()
         }
         masked = specs.pop("action_mask", None) if self.mode.whole else None
-        leaves = specs["observation"] if self.mode.whole else Composite(specs, shape=(b, n))
+        flat = self.mode.whole and self.mode.flat
+        leaves = specs["observation"] if flat else Composite(specs, shape=(b, n))
         low, high = (
             torch.tensor(x, dtype=torch.float32, device=device)
-            for x in privileged_bounds(self.scenario, self.mode)
+            for x in self.mode.state_bounds(self.scenario)
         )
         self.observation_spec = Composite(
             uav=Composite(
@@ -100,6 +103,7 @@ class CoLocEnv(EnvBase):
             low, high = ends
             shape = (b, n, self._runner.width)
             action = Bounded(low.expand(shape), high.expand(shape), shape, device, torch.float32)
+        self._actions = action
         self.action_spec = Composite(uav=Composite(action=action, shape=(b, n)), shape=(b,))
         reward = Unbounded((b, n, 1), device, torch.float32)
         self.reward_spec = Composite(uav=Composite(reward=reward, shape=(b, n)), shape=(b,))
@@ -113,6 +117,18 @@ class CoLocEnv(EnvBase):
         b = self.batch_size[0]
         return CoLocEnv(self.scenario, b, self.device, self.first_seed, action)
 
+    @property
+    def memory(self) -> Any:
+        """The action mode's memory at the step last observed."""
+        return self._runner.memory
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Actions drawn as their spec draws them, written into ``tensordict`` if given. (What every
+        ``EnvBase`` does by way of a TensorDict for each level of the spec.)"""
+        if tensordict is None:
+            tensordict = TensorDict({}, self.batch_size, self.device)
+        return tensordict.set(("uav", "action"), self._actions.rand())
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.first_seed = checked_seed(seed, self.scenario.name)
@@ -123,7 +139,7 @@ class CoLocEnv(EnvBase):
         rows = None
         if tensordict is not None and "_reset" in tensordict.keys():  # noqa: SIM118
             rows = tensordict["_reset"].view(-1)
-        self.world.reset(self._seeds, rows)
+        self.world.restart(self._seeds, rows)
         moved = self._seeds + self.batch_size[0]
         self._seeds = moved if rows is None else torch.where(rows, moved, self._seeds)
         return self._observe(self._runner.reset(rows)).copy()
@@ -142,19 +158,21 @@ class CoLocEnv(EnvBase):
             self._sensed = self.world.sensed
             self._frames = self._window(self._sensed).unbind(1)
         out = self._frames[self.world.cursor]
+        out.set("state", self._runner.state())
         if self.mode.whole:
-            out["uav"].set("observation", leaves["observation"])
+            if self.mode.flat:
+                out["uav"].set("observation", leaves["observation"])
+            else:
+                parts = {name: leaf for name, leaf in leaves.items() if name != "action_mask"}
+                each = TensorDict(parts, out["uav"].shape, device=self.device)
+                out["uav"].set("observation", each)
             if "action_mask" in leaves:
                 out["uav"].set("action_mask", leaves["action_mask"] > 0)
-            out.set("state", self._runner.state())
             return out
-        observation = out["uav", "observation"]
-        messages, heard = self.world.messages()
-        observation.set("messages", messages)
-        observation.set("message_mask", heard)
+        observation = out["uav"]["observation"]
+        observation.set("messages", self.world.messages())
         for name, leaf in leaves.items():
             observation.set(name, leaf)
-        out.set("state", self._runner.state())
         return out
 
     def _window(self, sensed: Sensed) -> TensorDict:
@@ -246,7 +264,7 @@ class PerUavEnv(EnvBase):
         """A step's entries, a row per UAV."""
         seen = entries["uav", "observation"]
         observation = seen
-        if not self.mode.whole:
+        if not (self.mode.whole and self.mode.flat):
             observation = torch.cat([seen[name] for name in self.leaves], -1)
         flags = ("done", "terminated", "truncated")
         return TensorDict(

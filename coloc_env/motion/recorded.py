@@ -23,6 +23,11 @@ class RecordedMotion(Motion):
     attitude: Series
     valid: Series | None = None
 
+    @property
+    def tracked(self) -> bool:
+        """Whether there is truth to score against at most steps."""
+        return self.valid is None or bool(self.valid.values.float().mean() >= 0.5)
+
     def start(self, keys: Int64[Tensor, "R"], arena: Arena) -> Carry:
         length = len(self.position.values)
         shapes = {

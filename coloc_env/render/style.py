@@ -19,7 +19,16 @@ FONT = {
 }
 
 # Okabe and Ito's colours without yellow and black, then two of Tol's: distinct to all eyes.
-UAV_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#7F7F1F")
+UAV_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#882255",
+    "#7F7F1F",
+)
 
 
 def uav_colours(n_uavs: int) -> np.ndarray:

@@ -46,7 +46,7 @@ def indoor(
     """
     if anchors.nlos_anchor is not None and not anchors.anchors:
         raise ValueError(f"nlos_anchor={anchors.nlos_anchor} is not allowed: there are no anchors")
-    arena = Arena(3, team.n_uavs, dt, (0.0, 0.0, 0.0), room)
+    arena, radio = Arena(3, team.n_uavs, dt, (0.0, 0.0, 0.0), room), network.network()
     true: list[Sensor] = []
     believed: list[Sensor] = []
     process: Process = ConstantVelocity(accel_std=0.1)
@@ -66,9 +66,9 @@ def indoor(
         name="indoor-v0",
         arena=arena,
         horizon=horizon,
-        motion=control.of(kidnap.of(MOTIONS[motion], dt), v_max),
+        motion=control.of(kidnap.of(MOTIONS[motion], dt), v_max, radio.walls),
         sensors=tuple(true),
-        network=network.network(),
+        network=radio,
         prior=prior.at_start(),
         process=process,
         believed_sensors=tuple(believed),

@@ -25,6 +25,7 @@ SCENARIOS = Registry(
         "replay-stein-euroc-v0": "coloc_env.scenarios.replay_stein_euroc:replay_stein_euroc",
         "replay-tiers-v0": "coloc_env.scenarios.replay_tiers:replay_tiers",
         "replay-tuc-v0": "coloc_env.scenarios.replay_tuc:replay_tuc",
+        "replay-v0": "coloc_env.scenarios.replay:replay_own",
         "stein2d-v0": "coloc_env.scenarios.stein:stein2d",
         "stein3d-v0": "coloc_env.scenarios.stein:stein3d",
         "swarm-v0": "coloc_env.scenarios.swarm:swarm",

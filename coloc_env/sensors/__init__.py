@@ -9,7 +9,7 @@ from coloc_env.sensors.height import Height
 from coloc_env.sensors.imu import GRAVITY, Imu, ImuOptions, RecordedImu, SimulatedImuOptions
 from coloc_env.sensors.ins import Ins, InsOptions
 from coloc_env.sensors.landmarks import LandmarkOptions, Landmarks
-from coloc_env.sensors.odometry import Odometry
+from coloc_env.sensors.odometry import Odometry, RecordedOdometry
 from coloc_env.sensors.position_fix import AnchorUavOptions, PositionFix
 from coloc_env.sensors.ranging import AnchorRanging, Ranging, UavRangeOptions
 from coloc_env.sensors.reference import Reference
@@ -39,6 +39,7 @@ __all__ = [
     "RangeOptions",
     "Ranging",
     "RecordedImu",
+    "RecordedOdometry",
     "RecordedPoses",
     "RecordedSensor",
     "Reference",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64, Shaped
+from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
 from torch import Tensor
 
 from coloc_env import noise
@@ -14,6 +14,7 @@ from coloc_env.motion import Arena, Kinematics
 from coloc_env.series import Series
 
 MASK = (0.0, 1.0)
+_FARTHEST = 1e4  # m: of distances that a sensor can measure
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,18 @@ class Window:
         """One key per UAV, for a sensor's own events."""
         index = torch.arange(self.layout.arena.n_uavs, device=keys.device)
         return noise.fold(keys.unsqueeze(-1), index + stream)
+
+
+def usable(
+    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
+) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
+    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
+    ``ranges``, the first is no distance that a sensor can give. Whoever computes with a
+    measurement reads its leaf through this."""
+    mask = mask & z.isfinite().all(-1)
+    if ranges:
+        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
+    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
 
 
 class Sensor(ABC):

@@ -11,7 +11,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.geometry import rotate, rotation_matrix
 from coloc_env.options import Count, Group, Metres, PositiveMetres, Seconds, Share
-from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, usable
 
 
 def uniform_points(keys: Int64[Tensor, "R"], stream: str, count: int, layout: Layout) -> Tensor:
@@ -63,8 +63,9 @@ class Landmarks(Sensor):
         self, leaves: Mapping[str, Float32[Tensor, "B N F"]], attitude: Float32[Tensor, "B N a"]
     ) -> tuple[Float32[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
         shape = (self.count, -1)
-        apart = rotate(attitude.unsqueeze(-2), leaves["landmarks"].unflatten(-1, shape))
-        return leaves["landmark_map"].unflatten(-1, shape) - apart, leaves["landmark_mask"] > 0
+        z, there = usable(leaves["landmarks"].unflatten(-1, shape), leaves["landmark_mask"] > 0)
+        apart = rotate(attitude.unsqueeze(-2), z)
+        return leaves["landmark_map"].unflatten(-1, shape) - apart, there
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
         return {

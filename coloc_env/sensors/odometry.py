@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotation_between, unrotate
-from coloc_env.sensors.base import Layout, Leaf, Sensor, Window, require
+from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window, require
 
 
 @dataclass(frozen=True)
@@ -68,3 +68,18 @@ class Odometry(Sensor):
         n, width = clean.shape[-2:]
         white = noise.normal(window.keys, "odometry", width * n).unflatten(-1, (n, width))
         return {"odometry": (clean + white * self.std(clean)) * window.alive.unsqueeze(-1)}
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedOdometry(RecordedSensor):
+    """A recorded ``Odometry`` in the plane that may have one more leaf where samples are missing:
+
+    ``odometry_unknown`` [3]: what the mean over the step is off for want of samples, standard
+    deviations forward, left (m/s) and of the turn (rad/s), beside those of ``Odometry.std``.
+    """
+
+    def leaves(self, layout: Layout) -> dict[str, Leaf]:
+        own = super().leaves(layout)
+        if "odometry_unknown" in self.series:
+            own["odometry_unknown"] = Leaf(3, 0.0, unit="m/s, rad/s", frame="body")
+        return own

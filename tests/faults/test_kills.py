@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow  # .ci/run has it
 KILLS = int(os.environ.get("COLOC_KILLS", "2"))  # of each command
 COLOC = (sys.executable, "-c", "from training.cli.command import main; main()")
 EVALUATE = ("evaluate", "indoor-v0", "--agents", "dead_reckoning,ekf", "--runs", "2")

@@ -2,15 +2,20 @@
 
 import ast
 import importlib
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import training.examples
 
+ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(Path(training.examples.__file__).parent.glob("[a-z]*.py"))
 
 
@@ -51,22 +56,26 @@ def test_mixed_team_takes_a_learned_policy() -> None:
     assert example("mixed_team").main(episodes=1, horizon=10)["uav_0"] < 0.5
 
 
+@pytest.mark.slow
 def test_gym_single_uav_learns() -> None:
     module = example("gym_single_uav", "stable_baselines3")
     found = module.main(steps=800, envs=2, horizon=50, episodes=2)
     assert found["after"] < 0.7 * found["before"]
 
 
+@pytest.mark.slow
 def test_sb3_ppo_corrects_its_base() -> None:
     found = example("sb3_ppo", "stable_baselines3").main(steps=24_000, number=16, horizon=50)
     assert found["after"] < 0.8 * found["before"]
 
 
+@pytest.mark.slow
 def test_sb3_sac_learns() -> None:
     found = example("sb3_sac", "stable_baselines3").main(steps=4_000, number=4, horizon=50)
     assert found["after"] < 0.5 * found["before"]
 
 
+@pytest.mark.slow
 def test_torchrl_mappo_corrects_its_base() -> None:
     module = example("torchrl_mappo", "torchrl.objectives.multiagent")
     found = module.main(steps=20_000, worlds=16, horizon=50)
@@ -87,18 +96,50 @@ def test_supersuit_loses_what_the_example_says() -> None:
             method("scenario")
 
 
+@pytest.mark.slow
 def test_supersuit_learns() -> None:
     module = example("supersuit_sb3", "supersuit", "stable_baselines3")
     found = module.main(steps=6_000, copies=2, horizon=50)
     assert found["after"] < 0.5 * found["before"]
 
 
+@pytest.mark.slow
 def test_rllib_learns() -> None:
     module = example("rllib_ppo", "ray.rllib")
     found = module.main(iterations=3, steps=400, horizon=50, episodes=1)
     assert found["after"] < found["before"]
 
 
+@pytest.mark.slow
 def test_benchmarl_learns() -> None:
     found = example("benchmarl_mappo", "benchmarl").main(iterations=4, worlds=10, horizon=50)
     assert found["after"] < found["before"]
+
+
+@pytest.mark.slow
+def test_localized_learns_on_estimates() -> None:
+    module = example("localized", "vmas")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        before = module.actor_of(module.environment("navigation", "truth", 2, 0))
+        estimates = "ranges between agents only"
+        after = module.trained("navigation", estimates, steps=60_000, seed=0)
+        first, last = (module.measured("navigation", p, estimates, 64) for p in (before, after))
+    assert last["return"] > first["return"] + 0.2
+    assert 0 < last["error"] < 3
+
+
+def test_benchmarl_runs_tasks_by_its_own_command(tmp_path: Path) -> None:
+    """MAPPO where actions are numbers, QMIX where they are choices and masked."""
+    example("benchmarl_tasks", "benchmarl", "hydra")
+    few = ["experiment.max_n_iters=2", "experiment.loggers=[]", "experiment.evaluation=false"]
+    for policy in ("on", "off"):
+        few.append(f"experiment.{policy}_policy_collected_frames_per_batch=400")
+        few.append(f"experiment.{policy}_policy_n_envs_per_worker=20")
+    for algorithm, task in (("mappo", "survey-v0"), ("qmix", "schedule-v0")):
+        line = [sys.executable, "-m", "training.examples.benchmarl_tasks", f"task=coloc/{task}"]
+        line += [f"algorithm={algorithm}", "task.options='horizon=20'", *few]
+        environ = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(line, cwd=tmp_path, env=environ, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert "mean return" in done.stderr

@@ -13,11 +13,15 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.live import live
+from training.cli.recording import recording
+from training.cli.recordings import recordings
 from training.cli.render import render
 from training.cli.report import report
 from training.cli.reproduce import reproduce
 from training.cli.score import score, tasks
 from training.cli.train import train
+from training.cli.view import view
 
 
 class _Plain(TyperGroup):
@@ -67,12 +71,16 @@ for _command in (
     scenarios,
     agents,
     tasks,
+    recordings,
     render,
+    view,
+    live,
     bench,
     train,
     reproduce,
 ):
     app.command()(_command)
+app.add_typer(recording, name="recording")
 
 
 def _print_version(wanted: bool) -> None:

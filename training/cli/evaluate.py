@@ -91,11 +91,20 @@ def evaluate(
 
 def _show(found: "Evaluation") -> None:
     """Print the table, and what went wrong."""
-    from training.evaluation.tables import COLUMNS, heading, left_out, rows
+    from training.evaluation.tables import (
+        COLUMNS,
+        INNOVATION_COLUMNS,
+        heading,
+        innovation_rows,
+        left_out,
+        rows,
+    )
 
     columns = {key: title for key, title in COLUMNS.items() if key not in _TOO_WIDE}
     typer.echo(f"{heading(found)}; position errors in m")
     show(["", *columns.values()], rows(found, columns))
+    if found.innovations:
+        show(list(INNOVATION_COLUMNS), innovation_rows(found))
     if found.dropped:
         typer.echo(f"note: {left_out(found)}", err=True)
     for name, one in found.agents.items():

@@ -114,9 +114,10 @@ def reproduce(
 
 def _write_page(out: Path, file: Path) -> None:
     """The page alone, from the results that are there."""
-    from coloc_env.staging import staged_file
+    from coloc_env.staging import recover, staged_file
     from training.reproduce.page import read, render
 
+    recover(out)
     content = read(out / "results.json")
     images = Path(os.path.relpath(out, file.parent)).as_posix()
     with staged_file(file) as written:

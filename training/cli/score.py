@@ -24,16 +24,19 @@ def tasks(
     coloc tasks survey-v0
     """
     from agents.tasks import TASKS
+    from coloc_env.options import paragraphs
 
     if name is None:
         show(["task", ""], [[key, TASKS.summary(key)] for key in TASKS])
         typer.echo("coloc tasks TASK lists its options and its heuristics.")
         return
     explain(name, TASKS, "option")
-    policies = getattr(TASKS[name], "policies", {})
-    rows = [[key, " ".join((rule.__doc__ or "").split())] for key, rule in policies.items()]
-    typer.echo("")
-    show(["heuristic", ""], rows)
+    for what in ("policies", "planners"):
+        found = getattr(TASKS[name], what, {})
+        rows = [[key, paragraphs(rule.__doc__ or "")[0]] for key, rule in found.items()]
+        if rows:
+            typer.echo("")
+            show([{"policies": "heuristic", "planners": "planner"}[what], ""], rows)
 
 
 def score(
@@ -41,13 +44,19 @@ def score(
     policy: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="A heuristic of the task, or **module:function** of your own."
+            metavar="NAME",
+            help="A heuristic of the task, weights (**….safetensors**; several seeds': separated "
+            "by commas), or **module:function** of your own.",
         ),
     ],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the figures here, as JSON.")
     ] = None,
     worlds: Annotated[int, typer.Option(help="Worlds; fewer are no score to report.")] = 256,
+    label: Annotated[
+        str | None, typer.Option(help="What the leaderboard is to call the policy.")
+    ] = None,
+    link: Annotated[str | None, typer.Option(help="Where its code or paper is.")] = None,
     threads: Threads = 1,
 ) -> None:
     """Score a policy on a task's fixed worlds, which no training uses.
@@ -57,6 +66,8 @@ def score(
     coloc score survey-v0 --policy frontier
 
     coloc score schedule-v0 --policy my_module:my_policy --out score.json
+
+    coloc score survey-v0 --policy runs/1/policy.safetensors,runs/2/policy.safetensors
     """
     from training.threads import use_threads
 
@@ -65,20 +76,30 @@ def score(
         raise ValueError(f"--worlds {worlds} is not allowed: at least 4")
     import json
 
+    from coloc_env.staging import staged_file
     from training.evaluation.score import score as measure
 
     with progress() as advance:
         found = measure(task, policy, worlds, advance)
+    found |= {"label": label or policy, "link": link}
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        with staged_file(out) as file:
+            file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     low, high = found["interval_95"]
     lines = [
         ["return", f"{found['return']:.2f} ± {found['standard_error']:.2f}"],
         ["interquartile mean", f"{found['interquartile_mean']:.2f} [{low:.2f}, {high:.2f}]"],
         ["share of random … best known", f"{found['share_of_span']:.2f}"],
         ["error, m", f"{found['error']:.2f}"],
+        ["bytes", f"{found['bytes']:.0f}"],
+        ["distance, m", f"{found['distance']:.0f}"],
+        ["energy, kJ", f"{found['energy'] / 1000:.0f}"],
         ["others at random cost uav_0", f"{found['interaction']['cost']:.2f}"],
         ["ranges between UAVs are worth", f"{found['cooperation']['worth']:.2f}"],
     ]
-    show([f"{task}, {policy}", ""], lines)
+    if "seeds" in found:
+        low, high = found["seeds"]["interval_95"]
+        iqm = found["seeds"]["interquartile_mean"]
+        lines.append(["interquartile mean of seeds", f"{iqm:.2f} [{low:.2f}, {high:.2f}]"])
+    show([f"{task}, {found['label']}", ""], lines)

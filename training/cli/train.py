@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +21,14 @@ def train(
             metavar="KEY=VALUE",
             help="Set one option of the training; repeat it for more. "
             "**coloc train TRAINING** lists them.",
+        ),
+    ] = None,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="Train as this says: a run.json, a checkpoint's card, or a shipped checkpoint's "
+            "name. **--set** changes single options.",
         ),
     ] = None,
     out: Annotated[
@@ -50,6 +58,10 @@ def train(
 
     coloc train --resume runs/corrector
 
+    coloc train --config runs/corrector/run.json --set seed=1 --out runs/again
+
+    coloc train task-mappo --out runs/survey --set task=survey-v0:reward=sigma
+
     coloc evaluate indoor-v0 --agents apf,pfnn:weights=runs/corrector/pfnn.safetensors --out results
 
     tensorboard --logdir runs
@@ -60,6 +72,11 @@ def train(
     from training.learning.registry import TRAININGS
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every buffer it makes
+    chosen: dict[str, Any] = {}
+    if config is not None:
+        if name is not None or out is None:
+            raise ValueError("--config FILE says what to train, and --out DIR is needed")
+        name, chosen = run.recipe(config)
     if resume is not None:
         if name is not None or out is not None or settings:
             raise ValueError("--resume goes alone: a run continues as it was started")
@@ -76,7 +93,7 @@ def train(
         return
     else:
         known = TRAININGS.options_of(name)
-        chosen = dict(parse(name, text, known) for text in settings or ())
+        chosen |= dict(parse(name, text, known) for text in settings or ())
         with progress() as bars:
             weights = run.start(name, chosen, out, bars)
     typer.echo(f"weights written to {weights}")

@@ -13,6 +13,7 @@ from coloc_env.bounds import Bound, posterior_bound
 from coloc_env.scenario import Scenario
 from coloc_env.seeding import checked_seed
 from coloc_env.world import World
+from training.evaluation.innovations import innovations, tracked
 from training.evaluation.record import RunRecord, record
 from training.evaluation.results import Evaluation
 from training.evaluation.rollout import NUMERICAL, Breakdown, rollout
@@ -53,7 +54,8 @@ def evaluate(
     """
     _check(agents, runs, seed, chunk)
     team = {name: make(name, scenario) for name in agents}
-    known = _bound(scenario, runs, seed, progress) if bound else None
+    truthful = tracked(scenario)
+    known = _bound(scenario, runs, seed, progress) if bound and truthful else None
     records: dict[str, RunRecord] = {}
     errors: dict[str, Exception] = {}
     for name, localizer in team.items():
@@ -64,12 +66,15 @@ def evaluate(
             errors[name] = error
     if not records:
         raise next(iter(errors.values()))
+    seeds = torch.arange(seed, seed + runs)
+    without_truth = {} if truthful else {n: innovations(team[n], scenario, seeds) for n in records}
     return Evaluation(
         scenario,
         next(iter(records.values())).worlds,
         known,
         records,
         {name: f"{type(e).__name__}: {' '.join(str(e).split())}" for name, e in errors.items()},
+        {name: figures for name, (figures, _) in without_truth.items()},
     )
 
 
@@ -78,8 +83,8 @@ def split_agents(text: str) -> list[str]:
     option before (``apf:bounds=100,800``), and so does a piece of a path (``weights=a,b/c``)."""
     names: list[str] = []
     for piece in text.split(","):
-        head = piece.partition("=")[0]
-        path = "/" in head or ".safetensors" in head
+        head, name = piece.partition("=")[0], piece.partition(":")[0]
+        path = "/" in head or ".safetensors" in head or "=" in name
         if names and (path or piece[:1] in set("0123456789+-.")):
             names[-1] += f",{piece}"
         elif piece.strip():

@@ -10,7 +10,8 @@ from training.evaluation.tum import write_tum
 
 FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
 REPORT = "report.html"
-NAMES = ("results.csv", "table.md", *FIGURES, "tum", runs.FILE, REPORT, "results.json")
+WRITTEN = ("results.csv", "table.md", *FIGURES, "tum", runs.FILE, "results.json")
+NAMES = (REPORT, *WRITTEN)  # all that may be there; the last marks a whole folder
 
 
 def write(results: Evaluation, folder: Path) -> None:

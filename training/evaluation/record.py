@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from agents.localizer import Localizer
@@ -187,7 +187,7 @@ def _recorded(
     series: dict[str, Tensor] = {}
     for step in rollout(localizer, scenario, seeds, stop=stop):
         k, world = step.k, step.world
-        links[k] = _links(step.world)
+        links[k] = step.world.links[0]
         truth[:, k], attitude[k] = world.truth.position, world.truth.attitude[0]
         apart = step.action[..., :dim] - world.truth.position
         offset[:, k] = apart.to(torch.float32)
@@ -207,7 +207,7 @@ def _recorded(
             attitude.numpy(),
             scored.numpy(),
             links.numpy(),
-            _places(step.world),
+            places_of(step.world),
         ),
         offset.numpy(),
         error.numpy(),
@@ -218,17 +218,7 @@ def _recorded(
     )
 
 
-def _links(world: World) -> Bool[Tensor, "N N"]:
-    """Whether UAV i hears UAV j in the first world."""
-    heard, senders = world.now.heard[0] > 0, world.now.senders
-    if senders is None:
-        return heard
-    n = len(heard)
-    counts = torch.zeros(n, n, dtype=torch.int64)
-    return counts.scatter_add_(1, senders[0], heard.long()) > 0
-
-
-def _places(world: World) -> dict[str, Floats]:
+def places_of(world: World) -> dict[str, Floats]:
     """Positions [M, d] of landmarks and anchors in the first world, m."""
     dim, static = world.scenario.arena.dim, world.static
     maps = {"landmarks": "landmark_map", "anchors": "anchor_map"}

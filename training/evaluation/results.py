@@ -11,6 +11,7 @@ import torch
 from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from training.evaluation import metrics
+from training.evaluation.innovations import disagreement
 from training.evaluation.metrics import Difference, Flags, Floats
 from training.evaluation.record import RunRecord, Worlds
 
@@ -26,6 +27,7 @@ METRICS = (
     "diverged_runs",
     "nees",
     "avg_particles",
+    "bytes_per_step",
     "ms_per_step",
     "ratio_to_bound",
     "diagnostics",
@@ -36,7 +38,8 @@ METRICS = (
 class Evaluation:
     """All agents' runs in the same worlds, and the bound of those worlds (None: none is known).
 
-    ``errors``: of agents whose evaluation ended in an error, what it was.
+    ``errors``: of agents whose evaluation ended in an error, what it was. ``innovations``: of each
+    agent what can be said without truth, where there is none (``training.evaluation.innovations``).
     """
 
     scenario: Scenario
@@ -44,6 +47,7 @@ class Evaluation:
     bound: Bound | None
     agents: dict[str, RunRecord]
     errors: dict[str, str] = field(default_factory=dict)
+    innovations: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
     def seed(self) -> int:
@@ -87,6 +91,13 @@ class Evaluation:
         _, steps, n_uavs, dim = self.worlds.truth.shape
         return self.scenario.reference.errors(seeds, steps, n_uavs, dim, self.dt)
 
+    @cached_property
+    def disagreement(self) -> dict[str, float]:
+        """How far each agent is from the mean of the others, m; known where truth is not."""
+        if not self.innovations:
+            return {}
+        return disagreement({name: one.offset for name, one in self.agents.items()})
+
     def diverged(self, agent: str) -> Flags:
         """[R]: runs in which a UAV ends lost or an estimate was not finite."""
         one = self.agents[agent]
@@ -115,6 +126,12 @@ class Evaluation:
             | {name: self._no_metrics(error) for name, error in self.errors.items()},
         }
 
+    def _repr_html_(self) -> str:
+        """The main table, in notebooks."""
+        from training.evaluation.tables import html_table
+
+        return html_table(self)
+
     def _metrics(self, agent: str) -> dict[str, Any]:
         one, scored = self.agents[agent], self.worlds.scored
         errors, per_run = one.error[scored], metrics.rmse_per_run(one.error, scored)
@@ -138,6 +155,7 @@ class Evaluation:
             "diverged_runs": int(self.diverged(agent).sum()),
             "nees": metrics.mean(one.nees[scored]),
             "avg_particles": own.pop("particles", None),
+            "bytes_per_step": own.pop("bytes", None),
             "ms_per_step": one.ms_per_step,
             "ratio_to_bound": rmse / bound if bound > 0 else None,
             "diagnostics": self._diagnostics(agent) | own,
@@ -177,6 +195,9 @@ class Evaluation:
             figures["nees_undefined_share"] = undefined
         if one.messages:
             figures["raised_runs"] = len(one.messages)
+        figures |= self.innovations.get(agent, {})
+        if agent in self.disagreement:
+            figures["disagreement"] = self.disagreement[agent]
         if self.dropped:
             figures["dropped_measurements"] = sum(self.dropped.values())
         return figures

@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from coloc_env.json_files import read_json
+from coloc_env.staging import recover
 from training.evaluation.metrics import Flags, Floats, rmse_per_step
 from training.evaluation.record import Arrays
 from training.evaluation.results import Evaluation
@@ -110,6 +111,7 @@ def write(runs: Runs, folder: Path) -> None:
 def read(folder: Path) -> Runs:
     """What an evaluation left in a folder. ValueError, in one line, for one that holds no whole
     evaluation."""
+    recover(folder)
     if not (folder / "results.json").is_file():
         raise ValueError(f"{folder} holds no results.json: a folder of `coloc evaluate` is needed")
     needed = {"scenario": str, "seed": int, "runs": int, "steps": int, "agents": dict}

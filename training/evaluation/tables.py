@@ -1,6 +1,7 @@
 """Tables of an evaluation as text: the main one, Markdown and CSV; and how numbers are shown."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -18,6 +19,7 @@ COLUMNS = {
     "diverged_runs": "diverged",
     "nees": "NEES",
     "avg_particles": "particles",
+    "bytes_per_step": "bytes/step",
     "ms_per_step": "ms/step",
     "ratio_to_bound": "× bound",
 }
@@ -26,8 +28,19 @@ _EXPLAINED = """\
 Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs, ± its
 standard deviation over runs; max is the mean over runs and UAVs of the largest error. A run counts
 as diverged if a UAV's error stays above {:g} m over its last {:g} s, or if an estimate was not
-finite; it stays in every figure. NEES: {} is consistent, more is overconfident. ms/step: the whole
-team, one world, one thread."""
+finite; it stays in every figure. NEES: {} is consistent, more is overconfident. bytes/step: what
+each UAV sends to others in a step. ms/step: the whole team, one world, one thread."""
+
+
+WITHOUT_TRUTH = (
+    "Without ground truth: mean NIS of each sensor's measurements and where it lies for a "
+    "consistent filter, correlation of a link's successive innovations (0 if white), share beyond "
+    "the 99.9 % gate, predicted deviation per axis and distance from the other methods' mean (m)."
+)
+INNOVATION_COLUMNS = (
+    "agent", "sensor", "NIS", "band", "correlation", "band of it", "rejected", "predicted σ",
+    "disagreement",
+)  # fmt: skip
 
 
 def rows(results: Evaluation, keys: Iterable[str] = COLUMNS) -> list[list[str]]:
@@ -63,6 +76,8 @@ def markdown(results: Evaluation) -> str:
         differences = [[name, *_interval(results, name, names[0])] for name in names[1:]]
         text += ["", f"RMSE minus that of `{names[0]}`, paired by run:", ""]
         text += table(["agent", "mean difference", "95 % interval"], differences)
+    if results.innovations:
+        text += ["", WITHOUT_TRUTH, "", *table(INNOVATION_COLUMNS, innovation_rows(results), 2)]
     for name, one in results.agents.items():
         if one.messages:
             how_many = f"{len(one.messages)} of {results.runs} runs"
@@ -72,6 +87,33 @@ def markdown(results: Evaluation) -> str:
     if results.dropped:
         text += ["", left_out(results)]
     return "\n".join(text) + "\n"
+
+
+def innovation_rows(results: Evaluation) -> list[list[str]]:
+    """What is known of each agent without truth: a line a sensor."""
+    lines = []
+    for name, found in results.innovations.items():
+        figures = plain(found | {"apart": results.disagreement.get(name)})
+        ends = (short(figures.get("predicted_std")), short(figures["apart"]))
+        sensors = [key.removeprefix("nis_") for key in found if f"{key}_low" in found]
+        for sensor in sensors or [""]:
+            own = {key: figures.get(f"{key}_{sensor}") for key in ("nis", "whiteness", "rejected")}
+            band = [short(figures.get(f"nis_{sensor}_{end}")) for end in ("low", "high")]
+            band = band if sensor else ["–"]
+            white = short(figures.get(f"whiteness_{sensor}_band"))
+            shown = (short(own["nis"]), " to ".join(band), short(own["whiteness"]), f"± {white}")
+            lines.append([name, sensor or "–", *shown, short(own["rejected"]), *ends])
+    return lines
+
+
+def html_table(results: Evaluation) -> str:
+    """The main table as notebooks show it."""
+    lines = [["", *COLUMNS.values()], *rows(results)]
+    cells = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in line)
+        for line, tag in zip(lines, ["th", *["td"] * (len(lines) - 1)], strict=True)
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in cells) + "</table>"
 
 
 def left_out(results: Evaluation) -> str:

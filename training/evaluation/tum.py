@@ -14,8 +14,8 @@ from training.evaluation.results import Evaluation
 
 
 def write_tum(results: Evaluation, folder: Path) -> None:
-    """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only; of a
-    recording in the frame that it was recorded in."""
+    """The first run: ``groundtruth/uav_i.txt`` and ``AGENT/uav_i.txt``, scored steps only (without
+    truth: all steps, and no groundtruth); of a recording in the frame that it was recorded in."""
     truth = results.worlds.truth[0] + results.origin
     time = np.arange(results.scenario.horizon) * results.dt
     attitude = quaternions(results.worlds.attitude)
@@ -23,10 +23,13 @@ def write_tum(results: Evaluation, folder: Path) -> None:
     tracks = {"groundtruth": (truth, attitude)}
     for name, label in zip(results.agents, folder_names(list(results.agents)), strict=True):
         tracks[label] = (truth + results.agents[name].offset[0], identity)
+    unknown = bool(results.innovations)
+    if unknown:
+        del tracks["groundtruth"]
     for label, (position, turned) in tracks.items():
         (folder / label).mkdir(parents=True)
         for i, uav in enumerate(results.scenario.agents):
-            now = results.worlds.scored[0, :, i]
+            now = results.worlds.scored[0, :, i] | unknown
             text = tum_text(time[now], position[now, i], turned[now, i])
             (folder / label / f"{uav}.txt").write_text(text, encoding="ascii")
 

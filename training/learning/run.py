@@ -1,7 +1,7 @@
 """Training runs: one folder each, which another process can continue exactly.
 
 - run.json: what is trained, with which options, command and versions; locked while a process trains
-- metrics/, tensorboard/: training.learning.logger
+- metrics/, tensorboard/: training.learning.logger; curves.json, curves.png once it is finished
 - state.safetensors: the state after the last whole epoch, until the run is finished
 - NAME.safetensors, NAME.json: the trained weights and their card, once it is
 """
@@ -21,13 +21,13 @@ from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
-from agents.weights import SUFFIX, Learned, write
+from agents.weights import SUFFIX, Learned, card_of, shipped, write
 from coloc_env import options
 from coloc_env.json_files import read_json
 from coloc_env.options import Quantity
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
 from training.evaluation.tables import typed
-from training.learning import state
+from training.learning import curves, state
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
 from training.learning.registry import TRAININGS
@@ -139,6 +139,28 @@ def start(name: str, chosen: Mapping[str, Any], out: Path, progress: Progress) -
         return _train(out, config, training, progress)
 
 
+def recipe(source: str) -> tuple[str, dict[str, Any]]:
+    """What a config file trains, and with which options: a run's run.json, a checkpoint's card, or
+    any JSON with ``training`` and ``options``; by path, or a shipped checkpoint's name.
+
+    Raises ValueError if it holds neither.
+    """
+    fields = {"training": str, "options": dict}
+    if source in shipped():
+        return _recipe(f"checkpoint {source}", card_of(source))
+    file = Path(source)
+    if not file.is_file():
+        known = ", ".join(shipped())
+        raise ValueError(f"{file}: no such file, and no checkpoint of that name: {known}")
+    return _recipe(str(file), read_json(file, "a training's config", fields))
+
+
+def _recipe(source: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    if not {"training", "options"} <= config.keys():
+        raise ValueError(f"{source} does not say how it was trained")
+    return config["training"], config["options"]
+
+
 def resume(folder: Path, progress: Progress) -> Path:
     """Continue the run in a folder to the weights that it would have had if it had never stopped;
     returns their file."""
@@ -181,6 +203,7 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
         "metrics": logger.last,
         "scores": training.score(progress),
     }
+    curves.write(folder, name)
     write(weights, training.module, card)
     file.unlink(missing_ok=True)
     return weights

@@ -58,17 +58,22 @@ def exported(model: PPO, normal: VecNormalize, actor: Actor) -> None:
 
 class Sb3Trainer:
     """Epochs of ``PPO.learn`` over fresh worlds, as ``training.learning.run`` runs them: both its
-    trainer and its epochs. Everything that an epoch draws depends on the epoch alone."""
+    trainer and its epochs. Everything that an epoch draws depends on the epoch alone.
+
+    ``export`` writes what was learned into what is saved; ``figures`` makes a callback that logs
+    what rewards say of a rollout.
+    """
 
     def __init__(
         self,
         model: PPO,
         env: VecNormalize,
-        actor: Actor,
+        export: Callable[[], None],
         epochs: int,
         first: Callable[[int], int],
+        figures: Callable[[], BaseCallback],
     ) -> None:
-        self.model, self.env, self.actor = model, env, actor
+        self.model, self.env, self.export, self.figures = model, env, export, figures
         self.epoch, self.epochs, self.first = 0, epochs, first
         self.rate = model.lr_schedule(1.0)
         self.collected_frames = 0
@@ -87,10 +92,12 @@ class Sb3Trainer:
             self.model._last_obs = None  # the epoch's worlds start now
             rate = self.rate * (1 - self.epoch / self.epochs)
             self.model.lr_schedule = partial(_constant, rate)
-            self.model.learn(frames, _Errors(), log_interval=frames + 1, reset_num_timesteps=False)
+            self.model.learn(
+                frames, self.figures(), log_interval=frames + 1, reset_num_timesteps=False
+            )
             self.collected_frames = self.model.num_timesteps
             self.epoch += 1
-            exported(self.model, self.env, self.actor)
+            self.export()
             self.on_epoch_end(self.epoch)
 
     def state_dict(self) -> dict[str, Any]:
@@ -101,8 +108,13 @@ class Sb3Trainer:
             "updates": self.model._n_updates,
             "policy": dict(self.model.policy.state_dict()),
             "optimizer": self.model.policy.optimizer.state_dict(),
-            **{key: _numbers(getattr(self.env, key)) for key in _RUNNING},
+            **{key: _numbers(getattr(self.env, key)) for key in self._running},
         }
+
+    @property
+    def _running(self) -> list[str]:
+        """The statistics that ``VecNormalize`` keeps."""
+        return [key for key in _RUNNING if getattr(self.env, key, None) is not None]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.epoch, self.collected_frames = state_dict["epoch"], state_dict["frames"]
@@ -110,11 +122,11 @@ class Sb3Trainer:
         self.model._n_updates = state_dict["updates"]
         self.model.policy.load_state_dict(state_dict["policy"])
         self.model.policy.optimizer.load_state_dict(state_dict["optimizer"])
-        for key in _RUNNING:
+        for key in self._running:
             mean, var, count = state_dict[key]
             running: Any = getattr(self.env, key)
             running.mean, running.var, running.count = mean.numpy(), var.numpy(), count
-        exported(self.model, self.env, self.actor)
+        self.export()
 
 
 def _numbers(running: RunningMeanStd) -> list[Tensor | float]:
@@ -209,7 +221,8 @@ def sb3_ppo(
         policy_kwargs={"net_arch": [hidden, hidden], "log_std_init": float(np.log(0.3))},
     )
     actor = actor_for(mode, hidden=hidden, squash="clip")
-    trainer = Sb3Trainer(model, env, actor, epochs, partial(world_seed, seed, worlds=worlds))
+    export, first = partial(exported, model, env, actor), partial(world_seed, seed, worlds=worlds)
+    trainer = Sb3Trainer(model, env, export, epochs, first, _Errors)
     return Training(
         module=actor,
         collector=trainer,

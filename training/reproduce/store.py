@@ -9,6 +9,8 @@ import hashlib
 import io
 import json
 import re
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from coloc_env.staging import staged_file
 Arrays = dict[str, np.ndarray]
 Facts = dict[str, Any]
 _FACTS = "facts.json"
+_UNREADABLE = (EOFError, NotImplementedError, AttributeError, zipfile.BadZipFile, zlib.error)
 _DIGEST = hashlib.sha256().digest_size  # bytes
 
 
@@ -58,12 +61,16 @@ class Store:
         archive = _archive(path)
         if archive is None:
             raise ValueError(f"{path} is damaged: run the command again to compute it again")
-        with np.load(io.BytesIO(archive), allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-        content = json.loads(arrays.pop(_FACTS).tobytes())
-        if _canonical(content["settings"]) != _canonical(settings):
+        try:
+            with np.load(io.BytesIO(archive), allow_pickle=False) as file:
+                arrays = {key: file[key] for key in file.files}
+            content = json.loads(arrays.pop(_FACTS).tobytes())
+            made, facts = content["settings"], content["facts"]
+        except (*_UNREADABLE, ValueError, LookupError, TypeError):
+            raise ValueError(f"{path} is no file of a store: remove it") from None
+        if _canonical(made) != _canonical(settings):
             raise ValueError(f"{path} was made with other settings: remove it")
-        return arrays, content["facts"]
+        return arrays, facts
 
     def empty(self) -> bool:
         """Whether nothing is stored."""

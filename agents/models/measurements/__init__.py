@@ -10,7 +10,6 @@ from agents.models.measurements.base import (
     no_neighbours,
     noise_std,
     received,
-    usable,
 )
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
@@ -33,6 +32,7 @@ from coloc_env.sensors import (
     SlowFlight,
     UavBearings,
 )
+from coloc_env.sensors.base import usable
 
 __all__ = [
     "MODELS",

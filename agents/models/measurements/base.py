@@ -4,6 +4,7 @@ A ``Block`` holds m measurements of k numbers each, per UAV, masked; filters of 
 UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,6 @@ from agents.models.process import Process
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 
-_FARTHEST = 1e4  # m: of distances that a sensor can measure
 _LEAST_STD = 1e-3  # m, rad
 
 
@@ -94,16 +94,9 @@ class Block:
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
 
 
-def usable(
-    z: Float[Tensor, "*s m k"], mask: Bool[Tensor, "*s m"], ranges: bool = False
-) -> tuple[Float[Tensor, "*s m k"], Bool[Tensor, "*s m"]]:
-    """Measurements and their mask, false (and the numbers 0) where a number is not finite or, with
-    ``ranges``, the first is no distance that a sensor can give. Every measurement model reads its
-    leaves through this."""
-    mask = mask & z.isfinite().all(-1)
-    if ranges:
-        mask = mask & (z[..., 0] > 0) & (z[..., 0] <= _FARTHEST)
-    return z.masked_fill(~mask.unsqueeze(-1), 0.0), mask
+def believed_biases(*std: float) -> tuple[float, ...]:
+    """Standard deviations of the biases of a link's numbers; none where all are 0."""
+    return std if any(std) else ()
 
 
 def noise_std(std: float) -> float:
@@ -113,10 +106,17 @@ def noise_std(std: float) -> float:
 
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
-    that marks which of its measurements are there (None: a single one, always)."""
+    that marks which of its measurements are there (None: a single one, always). ``testable`` is
+    false for a belief that enters like a measurement, and says nothing of who predicts well.
+    ``depth``: how many measurements of one link a step can have. ``bias_std`` of each number that a
+    link measures (empty: none is believed to be biased), over ``bias_time`` s."""
 
     cooperative = False
+    testable = True
     mask_leaf: str | None = None
+    depth = 1
+    bias_std: tuple[float, ...] = ()
+    bias_time = math.inf
 
     def count(self, observation: Observation) -> int:
         """How many measurements its block has."""

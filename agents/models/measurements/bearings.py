@@ -8,13 +8,14 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
-    usable,
 )
 from agents.models.process import Process
 from coloc_env.geometry import wrap_angle
 from coloc_env.observation import Observation
 from coloc_env.sensors import LandmarkBearings, UavBearings
+from coloc_env.sensors.base import usable
 
 
 def _range_bearing(
@@ -48,6 +49,7 @@ class LandmarkRangeBearings(Measurement):
     def __init__(self, sensor: LandmarkBearings) -> None:
         self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
         self.depth = sensor.depth
+        self.bias_std, self.bias_time = believed_biases(*sensor.bias_std), sensor.bias_time
 
     def read(
         self, observation: Observation
@@ -85,6 +87,7 @@ class UavRangeBearings(Measurement):
     def __init__(self, sensor: UavBearings) -> None:
         self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
         self.depth = sensor.depth
+        self.bias_std, self.bias_time = believed_biases(*sensor.bias_std), sensor.bias_time
 
     def read(
         self, observation: Observation

@@ -8,13 +8,14 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
-    usable,
 )
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import AnchorRanging, RangeNoise, Ranging
+from coloc_env.sensors.base import usable
 from coloc_env.sensors.ranging import Tags
 
 
@@ -27,6 +28,7 @@ class _Ranges(Measurement):
     def __init__(self, noise: RangeNoise, tags: Tags) -> None:
         self.noise, self.variance = noise, noise_std(noise.std) ** 2
         self.tags = tags
+        self.bias_std, self.bias_time = believed_biases(noise.bias_std), noise.bias_time
 
     def read(
         self, observation: Observation

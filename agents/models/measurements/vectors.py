@@ -11,13 +11,14 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
-    usable,
 )
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import Height, Landmarks, PositionFix, SlowFlight
+from coloc_env.sensors.base import usable
 
 
 class LandmarkVectors(Measurement):
@@ -126,6 +127,10 @@ class Heights(_Coordinates):
 
     mask_leaf = "height_mask"
 
+    def __init__(self, sensor: Height) -> None:
+        super().__init__(sensor)
+        self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
+
     def components(self, dim: int) -> slice:
         return slice(2, 3)
 
@@ -135,6 +140,8 @@ class Heights(_Coordinates):
 
 class Slowness(_Coordinates):
     """Velocity about zero."""
+
+    testable = False
 
     def components(self, dim: int) -> slice:
         return slice(dim, 2 * dim)

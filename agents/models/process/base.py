@@ -11,7 +11,7 @@ from agents.models.rotations import rotate_by, rotation_between
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 
-_LEAST_STD = 1e-6  # m, m/s, rad: of a prior, whose covariance must have an inverse
+LEAST_STD = 1e-6  # m, m/s, rad, and of biases: of a prior, whose covariance must have an inverse
 
 
 class Process(ABC):
@@ -60,7 +60,7 @@ class Process(ABC):
     ) -> tuple[Float[Tensor, "*s S"], Float[Tensor, "*s E E"]]:
         """Mean and error covariance that the prior leaf states."""
         d, a = self.dim, 4 if self.dim == 3 else 1
-        mean, std = prior[..., : 2 * d + a], prior[..., 2 * d + a :].clamp_min(_LEAST_STD)
+        mean, std = prior[..., : 2 * d + a], prior[..., 2 * d + a :].clamp_min(LEAST_STD)
         parts = [std[..., :d], std[..., d : d + 1].expand_as(std[..., :d])]
         if self.attitude_size:
             parts.append(std[..., d + 1 :].expand(*std.shape[:-1], d if d == 3 else 1))

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.models import rotations
-from agents.models.process.base import Process
+from agents.models.process.base import LEAST_STD, Process
 from agents.models.rotations import rotate, rotate_by
 from coloc_env import scenario as believed_processes
 from coloc_env.geometry import concat, cross_matrix
@@ -39,7 +39,8 @@ class InertialProcess(Process):
         self, mean: Float[Tensor, "*s 10"], std: Float[Tensor, "*s 9"]
     ) -> tuple[Float[Tensor, "*s S"], Float[Tensor, "*s E E"]]:
         if self.biased:
-            biases = [self.settings.accel_bias] * 3 + [self.settings.gyro_bias] * 3
+            stds = (self.settings.accel_bias, self.settings.gyro_bias)
+            biases = [max(std, LEAST_STD) for std in stds for _ in range(3)]
             std = torch.cat((std, std.new_tensor(biases).expand(*std.shape[:-1], 6)), -1)
             mean = torch.cat((mean, mean.new_zeros(*mean.shape[:-1], 6)), -1)
         return mean, torch.diag_embed(std**2)

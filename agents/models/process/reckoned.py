@@ -14,7 +14,9 @@ from coloc_env.sensors import Displacement, Ins, Odometry
 
 
 class WheeledProcess(Process):
-    """Planar dead reckoning: x = [p, v, θ], u = odometry [forward, left, turn] per second.
+    """Planar dead reckoning: x = [p, v, θ], u = odometry [forward, left, turn] per second; where
+    samples of a recording are missing u has the standard deviations of what they leave unknown
+    behind it, which add to the noise: σ² + s².
 
     The velocity is the odometry's, not an estimated quantity: the error is [δp, δθ].
     """
@@ -32,8 +34,16 @@ class WheeledProcess(Process):
     ) -> tuple[Float[Tensor, "*s 5"], Float[Tensor, "*s 3 3"]]:
         return mean, torch.diag_embed(std[..., [0, 1, 4]] ** 2)
 
-    def inputs(self, observation: Observation) -> Float[Tensor, "B N 3"]:
-        return observation["odometry"].double()
+    def inputs(self, observation: Observation) -> Float[Tensor, "B N U"]:
+        odometry = observation["odometry"].double()
+        if "odometry_unknown" not in observation:
+            return odometry
+        unknown = observation["odometry_unknown"].double().expand_as(odometry)
+        return torch.cat((odometry, unknown), -1)
+
+    def _std(self, u: Float[Tensor, "*s U"]) -> Float[Tensor, "*s 3"]:
+        std, unknown = self.odometry.std(u[..., :3]), u[..., 3:]
+        return torch.hypot(std, unknown) if unknown.shape[-1] else std
 
     def propagate(
         self,
@@ -43,18 +53,18 @@ class WheeledProcess(Process):
         noise: Float[Tensor, "*s 3"] | None = None,
     ) -> Float[Tensor, "*s 5"]:
         if noise is not None:
-            u = u + self.odometry.std(u) * noise
+            u = u[..., :3] + self._std(u) * noise
         dt = dt.unsqueeze(-1)
         velocity = rotate(x[..., 4:], u[..., :2])
         position = x[..., :2] + velocity * dt
         velocity = torch.where(dt > 0, velocity, x[..., 2:4])
-        return concat((position, velocity, rotate_by(x[..., 4:], u[..., 2:] * dt)))
+        return concat((position, velocity, rotate_by(x[..., 4:], u[..., 2:3] * dt)))
 
     def retreat(
         self, x: Float[Tensor, "*s 5"], u: Float[Tensor, "*s 3"], dt: Float[Tensor, "*s"]
     ) -> Float[Tensor, "*s 5"]:
         dt = dt.unsqueeze(-1)
-        heading = rotate_by(x[..., 4:], -u[..., 2:] * dt)
+        heading = rotate_by(x[..., 4:], -u[..., 2:3] * dt)
         return concat((x[..., :2] - rotate(heading, u[..., :2]) * dt, x[..., 2:4], heading))
 
     def linearize(
@@ -65,7 +75,7 @@ class WheeledProcess(Process):
         forward = (rotation @ u[..., :2, None])[..., 0] * h
         f = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 3, 3).clone()
         f[..., 0, 2], f[..., 1, 2] = -forward[..., 1], forward[..., 0]
-        variance = (self.odometry.std(u) * h) ** 2
+        variance = (self._std(u) * h) ** 2
         q = torch.zeros_like(f)
         q[..., :2, :2] = (rotation * variance[..., None, :2]) @ rotation.mT
         q[..., 2, 2] = variance[..., 2]

@@ -17,6 +17,8 @@ from coloc_env.scenario import Prior, Process, Reward, Scenario
 from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import AnchorRanging, Odometry, RangeNoise, Sensor
 
+_HELD = 0.25  # s, for which a sample of odometry stands: two steps of the robot's
+
 
 def corrected(recording: Recording, delay: float, bias: float) -> Recording:
     """The recording with its ranges ``delay`` s older than their stamps and ``bias`` m shorter."""
@@ -43,17 +45,17 @@ def anchor_scenario(
     grid: Grid,
     prior: Prior,
     process: Process,
-    range_std: float,
+    noise: RangeNoise,
     reward: Reward,
     odometry: Odometry | None = None,
 ) -> Scenario:
     """One tag with ranges to anchors, and with odometry if there is a belief about it."""
     places = tuple(map(tuple, recording.anchors.tolist()))
-    anchors = AnchorRanging(places, RangeNoise(std=range_std))
+    anchors = AnchorRanging(places, noise)
     sensors = [recorded_anchor_ranges(recording, grid, anchors)]
     believed: list[Sensor] = [anchors]
     if odometry is not None:
-        sensors.append(recorded_odometry(recording, grid, odometry, 0.0, 1.0))
+        sensors.append(recorded_odometry(recording, grid, odometry, _HELD))
         believed.append(odometry)
     return Scenario(
         name=name,

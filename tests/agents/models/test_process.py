@@ -23,6 +23,7 @@ from agents.models.process import (
 from coloc_env.bounds.process import error_model
 from coloc_env.motion import Aggressive, Arena, Kinematics, RandomVelocity
 from coloc_env.network import Network
+from coloc_env.observation import Observation
 from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import GRAVITY, Displacement, Imu, Ins, Odometry, Sensor
@@ -239,7 +240,9 @@ def test_held_acceleration_is_filterpys_and_that_of_the_bound(
     arena = Arena(dim, 3, dt, (0.0,) * dim, (10.0,) * dim)
     errors = error_model(replace(scenario, arena=arena, process=model))
     truth = Kinematics(x[..., :dim], x[..., dim:], x[..., :0])
-    for ours, theirs in zip(errors.transition(truth, truth), (f, found), strict=True):
+    for ours, theirs in zip(
+        errors.transition(truth, truth, Observation({})), (f, found), strict=True
+    ):
         torch.testing.assert_close(ours, theirs)
 
 

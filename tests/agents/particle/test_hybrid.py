@@ -21,7 +21,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
-NEVER, ALWAYS = "nnhpff:weights=none:threshold=1", "hpff:quantile=1e-12"
+NEVER, ALWAYS = "nnhpff:bank=false:weights=none:threshold=1", "hpff:bank=false:quantile=1e-12"
 MAINS = ("pf@particles=60", "apf@particles=40@bounds=30,60", "pfnn@weights=none", "ekf")
 
 
@@ -231,7 +231,7 @@ def test_an_auxiliary_that_knows_nothing_restarts_nothing(
 def test_a_threshold_is_a_probability_that_must_be_exceeded(tools: SimpleNamespace) -> None:
     """Resets are those of the network's probabilities, whatever these are."""
     scenario = wsn()
-    localizer = hybrid("nnhpff:weights=none:main=pf@particles=60", scenario)
+    localizer = hybrid("nnhpff:bank=false:weights=none:main=pf@particles=60", scenario)
     localizer.learn(judge())
     run = tools.play(localizer, scenario, range(4), 20)
     found = torch.stack([belief.probability for belief in run.beliefs[1:]])
@@ -257,7 +257,7 @@ def test_a_kidnapped_robot_is_found_again() -> None:
     """By the hybrid filter within a window, and not by its main filter alone."""
     hybrids, alone = (
         errors(name, wsn(n_uavs=1, kidnap_at=3.0))
-        for name in ("hpff:main=pf@particles=500", "pf:particles=500")
+        for name in ("hpff:bank=false:main=pf@particles=500", "pf:particles=500")
     )
     assert hybrids[5:30].max() < 0.6
     assert hybrids[32:].max() < 0.6
@@ -268,8 +268,8 @@ def test_a_kidnapped_robot_is_found_again() -> None:
 
 
 MIXED = (
-    "hpff:quantile=0.8:main=pf@particles=60",
-    "nnhpff:weights=none:main=apf@particles=40@bounds=30,60",
+    "hpff:bank=false:quantile=0.8:main=pf@particles=60",
+    "nnhpff:bank=false:weights=none:main=apf@particles=40@bounds=30,60",
 )
 
 
@@ -310,22 +310,22 @@ def test_a_step_changes_nothing_it_is_given(name: str, tools: SimpleNamespace) -
 
 def test_what_it_is_made_of_can_be_seen(tools: SimpleNamespace) -> None:
     scenario = room()
-    localizer = hybrid("hpff:main=apf@particles=40@bounds=30,60", scenario)
+    localizer = hybrid("hpff:bank=false:main=apf@particles=40@bounds=30,60", scenario)
     belief = tools.play(localizer, scenario, [0, 1], 3).beliefs[-1]
     figures = localizer.diagnostics(belief)
-    parts = {"particles", "ess_share", "renewed", "mahalanobis", "failure", "resets_per_run"}
-    assert set(figures) == parts
+    parts = {"particles", "ess_share", "renewed", "bytes", "mahalanobis", "failure"}
+    assert set(figures) == {*parts, "resets_per_run"}
     assert torch.equal(figures["particles"], localizer.main.diagnostics(belief.main)["particles"])
     assert torch.equal(figures["mahalanobis"], belief.distance)
     assert not localizer.exchanges
-    assert hybrid("hpff:main=ekf@robust=cross", scenario).exchanges
-    assert hybrid("hpff:auxiliary=ekf@robust=cross", scenario).exchanges
+    assert hybrid("hpff:bank=false:main=ekf@robust=cross", scenario).exchanges
+    assert hybrid("hpff:bank=false:auxiliary=ekf@robust=cross", scenario).exchanges
 
 
 @pytest.mark.parametrize("main", MAINS)
 def test_it_can_be_corrected_from_outside(main: str, tools: SimpleNamespace) -> None:
     scenario = room()
-    localizer = make(f"hpff:main={main}", scenario)
+    localizer = make(f"hpff:bank=false:main={main}", scenario)
     belief = tools.play(localizer, scenario, [0, 1], 3).beliefs[-1]
     offset = torch.tensor([1.0, -2.0, 0.5]).expand(2, 2, 3)
     moved = localizer.shifted(belief, offset)
@@ -356,7 +356,9 @@ def test_the_mahalanobis_distance_is_that_of_the_main_filters_estimate(
 
 
 @pytest.mark.parametrize("carry", ["module", "tensordict"])
-@pytest.mark.parametrize("name", ["hpff:quantile=0.8:main=pf@particles=60", "hpff:main=ekf"])
+@pytest.mark.parametrize(
+    "name", ["hpff:bank=false:quantile=0.8:main=pf@particles=60", "hpff:bank=false:main=ekf"]
+)
 def test_both_faces_act_alike(name: str, carry: str) -> None:
     scenario, seeds, steps = wsn(case=2, horizon=10), (4, 5), 10
     localizer = make(name, scenario)
@@ -382,15 +384,18 @@ def test_both_faces_act_alike(name: str, carry: str) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("hpff:main=emvf", "main='emvf' is not allowed: a particle or Kalman filter"),
-        ("hpff:main=hpff", "main='hpff' is not allowed: a particle or Kalman filter"),
-        ("hpff:main=ekf_joint", "main='ekf_joint' is not allowed"),
-        ("hpff:auxiliary=pf", "auxiliary='pf' is not allowed: emvf or a Kalman filter"),
-        ("hpff:auxiliary=hpff", "auxiliary='hpff' is not allowed"),
-        ("hpff:main=pff", "unknown agent 'pff'.*did you mean 'hpff'.*, pf, "),
-        ("hpff:main=pf@particle=200", "pf: unknown option 'particle'.*did you mean 'particles'"),
-        ("hpff:main=pf@particles=5", "pf: particles='5' is not allowed"),
-        ("hpff:auxiliary=emvf@memory=1", "emvf: memory='1' is not allowed"),
+        ("hpff:bank=false:main=emvf", "main='emvf' is not allowed: a particle or Kalman filter"),
+        ("hpff:bank=false:main=hpff", "main='hpff' is not allowed: a particle or Kalman filter"),
+        ("hpff:bank=false:main=ekf_joint", "main='ekf_joint' is not allowed"),
+        ("hpff:bank=false:auxiliary=pf", "auxiliary='pf' is not allowed: emvf or a Kalman filter"),
+        ("hpff:bank=false:auxiliary=hpff", "auxiliary='hpff' is not allowed"),
+        ("hpff:bank=false:main=pff", "unknown agent 'pff'.*did you mean 'hpff'.*, pf, "),
+        (
+            "hpff:bank=false:main=pf@particle=200",
+            "pf: unknown option 'particle'.*did you mean 'particles'",
+        ),
+        ("hpff:bank=false:main=pf@particles=5", "pf: particles='5' is not allowed"),
+        ("hpff:bank=false:auxiliary=emvf@memory=1", "emvf: memory='1' is not allowed"),
         ("hpff:quantile=1", "quantile='1' is not allowed: a number > 0 and < 1"),
         ("hpff:threshold=0.5", "unknown option 'threshold'"),
         ("nnhpff:weights=none:threshold=1.5", "threshold='1.5' is not allowed: a number from"),
@@ -413,6 +418,8 @@ def test_there_must_be_anchors_to_judge_by(name: str) -> None:
 
 
 def test_options_of_its_parts_come_in_their_names() -> None:
-    localizer: Any = hybrid("hpff:main=pf@particles=70@seed=3:auxiliary=emvf@memory=5", wsn())
+    localizer: Any = hybrid(
+        "hpff:bank=false:main=pf@particles=70@seed=3:auxiliary=emvf@memory=5", wsn()
+    )
     assert (localizer.main.particles, localizer.main.seed) == (70, 3)
     assert localizer.auxiliary.size == 5

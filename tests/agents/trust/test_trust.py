@@ -1,7 +1,9 @@
 """Learned trust: what its networks see, what they may change, and what the shipped ones catch."""
 
+import math
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +14,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from agents import make
-from agents.models.measurements import LandmarkVectors, UavRanges, received
+from agents.kalman.filter import predict
+from agents.models.measurements import Block, LandmarkVectors, UavRanges, received
 from agents.particle.likelihood import log_likelihood
-from agents.robust import Trust
-from agents.trust.features import leave_one_out
+from agents.robust import Prediction, Trust
+from agents.trust.features import features, innovation, leave_one_out
 from agents.trust.network import TrustNetwork
+from agents.weights import learned
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -82,12 +86,10 @@ def test_leave_one_out_is_a_loop(row: tuple[list[float], list[bool]]) -> None:
 
 
 def test_untrained_networks_trust_nearly_all() -> None:
-    network, features = TrustNetwork(), torch.randn(2, 3, 7, 15)
+    network, seen = TrustNetwork(), torch.randn(2, 3, 7, 15)
     assert sum(p.numel() for p in network.parameters()) < 3500
-    torch.testing.assert_close(
-        network.trust_vectors(features[..., :12]), torch.full((2, 3, 7), 0.98)
-    )
-    weight, bias = network.trust_ranges(features)
+    torch.testing.assert_close(network.trust_vectors(seen[..., :12]), torch.full((2, 3, 7), 0.98))
+    weight, bias = network.trust_ranges(seen)
     torch.testing.assert_close(weight, torch.full((2, 3, 7), 0.98))
     assert ((bias > 0) & (bias < 0.02)).all()
 
@@ -98,13 +100,100 @@ def test_weights_are_shares_and_biases_never_negative(scale: float) -> None:
     network = TrustNetwork().requires_grad_(False)
     for parameter in network.parameters():
         parameter.copy_(torch.randn(parameter.shape))
-    features = scale * torch.randn(2, 3, 500, 15)
-    weight, bias = network.trust_ranges(features)
-    for share in (weight, network.trust_vectors(features[..., :12])):
+    seen = scale * torch.randn(2, 3, 500, 15)
+    weight, bias = network.trust_ranges(seen)
+    for share in (weight, network.trust_vectors(seen[..., :12])):
         assert ((share >= 0) & (share <= 1)).all()
     assert (bias >= 0).all()
     assert bias.max() > 1
     assert weight.min() < 0.01
+
+
+@given(st.floats(0.02, 50.0), st.integers(0, 10**6), st.sampled_from([1, 2, 3]))
+@settings(deadline=None, max_examples=60)
+def test_scaling_all_lengths_changes_no_feature(scale: float, seed: int, k: int) -> None:
+    """Ranges (k = 1), range and bearing (k = 2, whose second number is an angle), vectors (k = 3),
+    of a prior in metres and radians."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    root, h, memory = draw(1, 1, 4, 4), draw(1, 1, 5, k, 4), draw(1, 1, 5, 3).square()
+    r, noise, theirs = draw(1, 1, 5, k), *(draw(1, 1, 5, k).square() + 0.1 for _ in range(2))
+    mask, std = torch.rand(1, 1, 5, generator=g) > 0.2, draw(1, 1).exp()
+    found = []
+    for length in (1.0, scale):
+        of_error = torch.tensor([length, length, length, 1.0])  # the last is an angle
+        of_number = torch.tensor([length, 1.0] if k == 2 else [length] * k)
+        block = Block(
+            residual=r * of_number,
+            jacobian=h * of_number.unsqueeze(-1) / of_error,
+            variance=noise * of_number**2,
+            mask=mask,
+            partner_variance=theirs * of_number**2,
+        )
+        covariance = (root @ root.mT) * of_error * of_error.unsqueeze(-1)
+        first = innovation(block, covariance, relative=True)
+        own_std, counts = (length * std).log(), [std, std, std]
+        found.append(features(block, first, own_std, counts, memory, relative=True))
+    torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-6)
+
+
+def test_scaling_a_world_changes_no_weight(tools: SimpleNamespace) -> None:
+    """Room, landmarks, noise, speeds and prior ten times as large, and the same draws."""
+    network = learned(TrustNetwork, "trust_bank").requires_grad_(False)
+    assert network.relative
+    small = make_scenario("indoor-v0", uwb_std=0.2, nlos=0.3, n_uavs=3)
+    localizer: Any = make("ekf_trust:bank=false:weights=none", small)
+    localizer.learn(network)
+    run = tools.play(localizer, small, [0, 1], 12)
+    process, models, screen = localizer.process, localizer.models, localizer.screen
+    near = received(small.believed, run.observations[11])
+    x, covariance, _ = predict(process, run.beliefs[11], run.observations[11])
+    blocks = [m.linearize(process, x, run.observations[11], near) for m in models]
+    e = torch.ones(process.error_size, dtype=torch.float64)
+    weights = []
+    for length in (1.0, 10.0):
+        of_error = e.clone()
+        of_error[:6] = length  # positions and velocities; angles are angles
+        scaled = [
+            replace(
+                block,
+                residual=length * block.residual,
+                jacobian=length * block.jacobian / of_error,
+                variance=length**2 * block.variance,
+                partner_variance=None
+                if block.partner_variance is None
+                else length**2 * block.partner_variance,
+            )
+            for block in blocks
+        ]
+        wide = covariance * of_error * of_error.unsqueeze(-1)
+        prior = Prediction(x, wide, run.observations[11], run.beliefs[11].memory)
+        trusts = screen.weigh(scaled, screen.judge(scaled, prior), True)
+        weights.append([trust.weight for trust in trusts])
+    for one, other, block in zip(*weights, blocks, strict=True):
+        torch.testing.assert_close(one[block.mask], other[block.mask], rtol=0, atol=1e-5)
+    assert weights[0][0][blocks[0].mask].std() > 1e-3
+
+
+def test_a_network_without_units_starts_as_one_with_them_judges() -> None:
+    """Where the noise is what it is made for."""
+    torch.manual_seed(0)
+    absolute = TrustNetwork().requires_grad_(False)
+    for parameter in absolute.parameters():
+        parameter.copy_(0.3 * torch.randn(parameter.shape))
+    relative = TrustNetwork.relative_to(absolute, 0.15, 0.2)
+    assert relative.features[2:5] == ("relative_std", "relative_doubt", "relative_partner")
+    seen = torch.randn(50, 15)
+    for std, call in ((0.15, "trust_vectors"), (0.2, "trust_ranges")):
+        shifted = seen.clone()
+        shifted[:, 2] -= math.log(std)
+        width = 12 if call == "trust_vectors" else 15
+        one = getattr(absolute, call)(seen[:, :width])
+        other = getattr(relative, call)(shifted[:, :width])
+        torch.testing.assert_close(one, other)
 
 
 # ---------------------------------------------------------------- what trust does
@@ -116,7 +205,7 @@ def test_full_trust_is_the_plain_filter(tools: SimpleNamespace) -> None:
     plain = make("ekf:iterations=6", scenario)
     run = tools.play(plain, scenario, [0, 1], 30)
     for logit, tolerance in ((40.0, 0.02), (None, 0.2)):  # standard deviations of the estimate
-        localizer: Any = make("ekf_trust", scenario, weights="none", iterations=6)
+        localizer: Any = make("ekf_trust:bank=false", scenario, weights="none", iterations=6)
         constant(localizer, logit, None if logit is None else -40.0)
         found = tools.replay(localizer, run.observations)
         for one, other in list(zip(found.estimates, run.estimates, strict=True))[10:]:
@@ -128,7 +217,7 @@ def test_full_trust_is_the_plain_filter(tools: SimpleNamespace) -> None:
 
 def test_no_trust_is_the_motion_model(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario, weights="none")
+    localizer: Any = make("ekf_trust:bank=false", scenario, weights="none")
     run = tools.play(localizer, scenario, [0, 1], 6)
     constant(localizer, -200.0, None)
     _, found = localizer.step(run.beliefs[5], run.observations[5])
@@ -141,7 +230,7 @@ def test_no_trust_is_the_motion_model(tools: SimpleNamespace) -> None:
 def test_biases_are_taken_off_ranges(bias: float, tools: SimpleNamespace) -> None:
     """Ranges longer by what the networks always say change nothing."""
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario, weights="none", iterations=1)
+    localizer: Any = make("ekf_trust:bank=false", scenario, weights="none", iterations=1)
     run = tools.play(localizer, scenario, [0, 1], 15)  # known well enough for a single iteration
     longer = 0.2 * torch.nn.functional.softplus(torch.tensor(bias - 4.0))
     seen, estimates = run.observations[14], []
@@ -209,7 +298,7 @@ def test_the_order_of_landmarks_is_the_order_of_their_trust(
     monkeypatch: pytest.MonkeyPatch, tools: SimpleNamespace
 ) -> None:
     scenario = make_scenario("indoor-v0", false_matches=0.1, landmarks=12)
-    localizer, seen = watched("ekf_trust", scenario, monkeypatch)
+    localizer, seen = watched("ekf_trust:bank=false", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1], 12)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
 
@@ -247,7 +336,7 @@ def test_a_link_remembers_itself_alone(tools: SimpleNamespace) -> None:
     """Other memories of one link change what becomes of that link's memory, and of no other's; nor
     of another UAV's. (What they change in an estimate is seen in later innovations only.)"""
     scenario = make_scenario("indoor-v0")
-    localizer: Any = make("ekf_trust", scenario)
+    localizer: Any = make("ekf_trust:bank=false", scenario)
     run = tools.play(localizer, scenario, [0, 1], 5)
     memory = run.beliefs[4].memory
     assert memory.shape[-1] == 1 + PER_LINK * (20 + 6)
@@ -267,7 +356,7 @@ def test_a_link_remembers_itself_alone(tools: SimpleNamespace) -> None:
 
 def test_links_that_are_not_seen_keep_their_memory(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0", landmark_radius=6.0)
-    localizer: Any = make("ekf_trust", scenario)
+    localizer: Any = make("ekf_trust:bank=false", scenario)
     run = tools.play(localizer, scenario, [0, 1], 8)
     links = [b.memory[..., 1 : 1 + 20 * PER_LINK].unflatten(-1, (20, -1)) for b in run.beliefs]
     for k, seen in enumerate(run.observations):
@@ -284,7 +373,7 @@ def test_uavs_that_say_nothing_change_nothing(
 ) -> None:
     """Nine UAVs of which three were never heard estimate as six do."""
     six, nine = (make_scenario("indoor-v0", n_uavs=n, nlos=0.3) for n in (6, 9))
-    run = tools.play(make("ekf_trust", six), six, [0, 1], 10)
+    run = tools.play(make("ekf_trust:bank=false", six), six, [0, 1], 10)
     widths = {"ranges": 1, "range_mask": 1, "messages": 9, "message_mask": 1, "links": 1}
 
     def larger(observation: Observation) -> Observation:
@@ -295,7 +384,7 @@ def test_uavs_that_say_nothing_change_nothing(
             leaves[name] = torch.cat((leaf, leaf[:, :3]), 1)
         return Observation(leaves)
 
-    wide = tools.replay(make("ekf_trust", nine), [larger(o) for o in run.observations])
+    wide = tools.replay(make("ekf_trust:bank=false", nine), [larger(o) for o in run.observations])
     for one, other in zip(wide.estimates, run.estimates, strict=True):
         tools.assert_same(one[:, :6], other, 1e-6)
 
@@ -314,7 +403,7 @@ def test_a_false_match_is_not_trusted_and_honest_ones_are(
 ) -> None:
     """A landmark's vector is another one's. Over 15 worlds: at most 0.03 against 0.91 at least."""
     scenario = make_scenario("indoor-v0")
-    localizer, seen = watched(f"ekf_trust:weights={weights}", scenario, monkeypatch)
+    localizer, seen = watched(f"ekf_trust:bank=false:weights={weights}", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1, 2], 56)
     for k in (10, 30, 55):
         now = run.observations[k]
@@ -337,7 +426,7 @@ def test_a_range_that_went_around_is_not_trusted_and_honest_ones_are(
     mean of 3 worlds, and as little as 0.12 where noise alone makes them 3 σ too long, which nothing
     tells from NLOS. The median without NLOS is 0.88 and 0.80 for the two trainings."""
     scenario = make_scenario("indoor-v0")
-    localizer, seen = watched(f"ekf_trust:weights={weights}", scenario, monkeypatch)
+    localizer, seen = watched(f"ekf_trust:bank=false:weights={weights}", scenario, monkeypatch)
     run = tools.play(localizer, scenario, [0, 1, 2], 56)
     whole = torch.cat([trusts[RANGES].weight[blocks[RANGES].mask] for blocks, trusts in seen])
     assert whole.quantile(0.5) > 0.7
@@ -387,5 +476,5 @@ def test_options_that_cannot_be(name: str, chosen: dict, words: str) -> None:
 
 
 def test_the_weights_are_never_trained_by_flying() -> None:
-    localizer: Any = make("ekf_trust", make_scenario("indoor-v0"))
+    localizer: Any = make("ekf_trust:bank=false", make_scenario("indoor-v0"))
     assert not any(p.requires_grad for p in localizer.screen.network.parameters())

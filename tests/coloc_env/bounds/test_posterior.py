@@ -476,11 +476,11 @@ def test_inertial_transition_is_the_derivative_of_the_strapdown_update() -> None
     zero, quiet = torch.zeros(15, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
     f, g = torch.func.jacfwd(strapdown, (0, 1))(zero, quiet)
     g = g * torch.tensor([0.05] * 3 + [0.01] * 3)
-    found, noise_added = error_model(task).transition(before, now)
+    found, noise_added = error_model(task).transition(before, now, Observation({}))
     torch.testing.assert_close(found[0, 0], f)
     torch.testing.assert_close(noise_added[0, 0], g @ g.mT, rtol=1e-6, atol=1e-15)
     unbiased = error_model(replace(task, sensors=(Imu(0.05, 0.01),)))
-    found, noise_added = unbiased.transition(before, now)
+    found, noise_added = unbiased.transition(before, now, Observation({}))
     torch.testing.assert_close(found[0, 0], f[:9, :9])
 
 
@@ -515,7 +515,7 @@ def test_wheeled_transition_is_the_derivative_of_dead_reckoning() -> None:
     zero = torch.zeros(3, dtype=torch.float64)
     f, g = torch.func.jacfwd(reckon, (0, 1))(zero, zero)
     g = g * odometry.std(torch.cat((moved, turned)) / 0.1) * 0.1
-    found, added = error_model(task).transition(before, now)
+    found, added = error_model(task).transition(before, now, Observation({}))
     torch.testing.assert_close(found[0, 0], f)
     torch.testing.assert_close(added[0, 0], g @ g.mT)
 
@@ -763,7 +763,7 @@ def test_what_cannot_be_bounded_is_refused() -> None:
     class Unheard(Sensor):
         leaves = Height.leaves
         sample = Height.sample
-        std, dropout = 0.1, 0.0
+        std, dropout, bias_std = 0.1, 0.0, 0.0
 
     with pytest.raises(NotImplementedError, match="Unheard"):
         posterior_bound(scenario(Unheard()), 1, steps=1)

@@ -178,3 +178,57 @@ def test_wrong_commands_are_one_line_at_every_face() -> None:
     world.reset(1)
     with pytest.raises(ValueError, match="its motion is not steered"):
         world.step(torch.zeros(1, 6, 9), Commands(torch.zeros(1, 6, 3)))
+
+
+WALLS = (((18.0, 5.0), (20.0, 25.0)), ((5.0, 12.0), (12.0, 14.0)))
+
+
+def test_walls_are_never_entered_nor_crossed() -> None:
+    start = ((1.0, 1.0), (4.0, 29.0))
+    motion = Steered("velocity", 12.0, 6.0, start, WALLS)
+    p = steer(motion, room(2, 3), random_commands(2, size=12.0)).position[0]
+    way = torch.linspace(0, 1, 101, dtype=torch.float64)[1:-1, None, None, None]
+    between = p[:-1] + way * p.diff(dim=0)
+    touched = torch.zeros((), dtype=torch.bool)
+    for low, high in WALLS:
+        bottom, top = torch.tensor(low).double(), torch.tensor(high).double()
+        for place in (p, between):
+            assert not ((place > bottom + 1e-9) & (place < top - 1e-9)).all(-1).any()
+        on = (p >= bottom) & (p <= top)
+        touched |= on.all(-1).any()
+    assert touched
+
+
+def test_jerk_is_limited_between_edges() -> None:
+    truth = steer(
+        Steered("acceleration", 30.0, 2.0, MIDDLE, j_max=0.8), room(2), random_commands(2, 20, 3.0)
+    )
+    p, v = truth.position[0], truth.velocity[0]
+    free = ((p > 0) & (p < torch.tensor(room(2).high))).all(-1)
+    free = (free[1:] & free[:-1])[1:] & (free[1:] & free[:-1])[:-1]
+    change = v.diff(dim=0).diff(dim=0).norm(dim=-1)[free]
+    assert change.max() < 0.8 * DT**2 + 1e-9
+    assert change.max() > 0.7 * DT**2
+    faster = v.norm(dim=-1).diff(dim=0)
+    assert faster.max() < 2.0 * DT + 1e-9  # walls slow down, and throw nobody back
+    assert (p == 0).any()
+
+
+def test_uavs_sent_at_each_other_keep_apart() -> None:
+    arena, size = Arena(2, 2, DT, (0.0, 0.0), (200.0, 30.0)), 2.5
+
+    def closest(motion: Steered, seed: int) -> float:
+        carry = motion.start(noise.row_keys(torch.tensor([seed])), arena)
+        least = 1e9
+        for k in range(150):
+            truth, carry = motion.advance(carry, torch.tensor([[k]]), arena)
+            p = truth.position[0, 0]
+            least = min(least, float((p[0] - p[1]).norm()))
+            carry = {**carry, "command": 8.0 * (p.flip(0) - p).unsqueeze(0)}
+        return least
+
+    for seed in range(5):
+        motion = Steered("velocity", 6.0, 2.0, keep_apart=size)
+        assert closest(motion, seed) > size - 1e-6
+        assert closest(motion, seed) < size + 2.0  # as near as they may
+    assert closest(Steered("velocity", 6.0, 2.0), 0) < size

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from training.cli.command import app
 from training.evaluation.evaluate import split_agents
-from training.evaluation.files import FIGURES, NAMES
+from training.evaluation.files import FIGURES, WRITTEN
 
 SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]
 CHECKOUT = Path(__file__).parents[3]
@@ -33,7 +33,7 @@ def test_evaluate(tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = evaluate(out, "--agents", "test_still,test_still:offset=0.5", "--seed", "5")
     assert done.exit_code == 0, done.output
-    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+    assert sorted(path.name for path in out.iterdir()) == sorted(WRITTEN)
     summary = json.loads((out / "results.json").read_text())
     assert summary["overrides"] == {"n_uavs": 2, "horizon": 12}
     assert (summary["seed"], summary["runs"], summary["steps"]) == (5, 2, 12)
@@ -43,7 +43,7 @@ def test_evaluate(tmp_path: Path) -> None:
     assert done.stderr == ""
     again = evaluate(out, "--agents", "test_still", "--no-figures", "--no-bound")
     assert again.exit_code == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted(set(NAMES) - set(FIGURES))
+    assert sorted(path.name for path in out.iterdir()) == sorted(set(WRITTEN) - set(FIGURES))
     assert json.loads((out / "results.json").read_text())["bound"] == {"rmse": None}
 
 
@@ -163,7 +163,7 @@ def test_results_are_kept_where_figures_cannot_be_drawn(
     assert done.exit_code == 1
     assert "RMSE" in done.stdout
     assert done.stderr == ("error: no figures could be drawn: [Errno 28] No space left on device\n")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(NAMES) - set(FIGURES)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(WRITTEN) - set(FIGURES)
 
 
 def test_one_agents_error_does_not_end_the_others(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_one_agents_error_does_not_end_the_others(tmp_path: Path) -> None:
     assert done.stderr == (
         "error: test_still:wrong=missing has no results: NotImplementedError: not there yet\n"
     )
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(NAMES)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(WRITTEN)
     agents = json.loads((tmp_path / "out" / "results.json").read_text())["agents"]
     assert list(agents) == ["test_still", "test_still:wrong=missing"]
     lost = agents["test_still:wrong=missing"]

@@ -1,5 +1,6 @@
 """The report: what it holds, and that a browser shows it, sorts it and plays it."""
 
+import html
 import json
 import re
 import shutil
@@ -11,7 +12,7 @@ import pytest
 from coloc_env import make_scenario
 from training.evaluation import runs
 from training.evaluation.evaluate import evaluate
-from training.evaluation.report.content import _axes, command, content, worst
+from training.evaluation.report.content import command, content, half_axes, worst
 from training.evaluation.report.page import page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -80,7 +81,7 @@ def test_ellipsoids_hold_what_they_say() -> None:
     """Of a Gaussian, 95 % lies within."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
-    axes = _axes(root @ root.T)
+    axes = half_axes(root @ root.T)
     points = rng.normal(size=(20000, 3)) @ root.T
     inside = (np.linalg.solve(axes, points.T) ** 2).sum(0) <= 1
     assert inside.mean() == pytest.approx(0.95, abs=0.01)
@@ -114,22 +115,26 @@ addEventListener("unhandledrejection", e => wrong.push(String(e.reason)));
 _CLICKS = """
 <script>
 setTimeout(() => {
-  const cells = () => [...document.querySelectorAll("#summary tbody tr td.name")].map(c => c.textContent);
-  const rmse = [...document.querySelectorAll("#summary th button")].find(b => b.textContent === "RMSE");
+  const all = selector => [...document.querySelectorAll(selector)];
+  const button = (selector, text) => all(selector).find(b => b.textContent === text);
+  const cells = () => all("#summary tbody tr td.name").map(c => c.textContent);
+  const rmse = button("#summary th button", "RMSE");
   rmse.click(); const up = cells(); rmse.click(); const down = cells();
   const slider = document.querySelector("input[type=range]");
   slider.value = slider.max; slider.dispatchEvent(new Event("input"));
   const clock = document.querySelector("output").textContent;
   const player = document.querySelector(".player .plot");
   const truth = player.data.find(t => t.name === "truth");
-  const show = [...document.querySelectorAll("button")].find(b => b.textContent === "show");
-  show.click();
-  const hide = [...document.querySelectorAll("#summary td button")].find(b => b.textContent === "dead_reckoning");
+  button("button", "show").click();
+  const hide = button("#summary td button", "dead_reckoning");
   const before = document.querySelector(".plot").data.length; hide.click();
   const after = document.querySelector(".plot").data.length;
-  document.body.append(Object.assign(document.createElement("pre"), { id: "found", textContent: JSON.stringify({
-    wrong, up, down, clock, x: truth.x, ready: document.body.dataset.ready, frame: slider.value, before, after,
-    plots: document.querySelectorAll(".plot .main-svg").length }) }));
+  const found = { wrong, up, down, clock, x: truth.x, ready: document.body.dataset.ready,
+    before, after, plots: all(".plot .main-svg").length };
+  const note = document.createElement("pre");
+  note.id = "found";
+  note.textContent = JSON.stringify(found);
+  document.body.append(note);
 }, 3000);
 </script>
 """
@@ -148,16 +153,15 @@ def test_a_browser_shows_it(evaluation, tmp_path) -> None:
         [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
             "--no-first-run", "--disable-background-networking", "--disable-component-update",
-            "--disable-sync", "--enable-unsafe-swiftshader", f"--user-data-dir={tmp_path / 'profile'}",
+            "--disable-sync", "--enable-unsafe-swiftshader",
+            f"--user-data-dir={tmp_path / 'profile'}",
             "--virtual-time-budget=20000", "--dump-dom", file.as_uri(),
         ],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
     written = re.search(r'<pre id="found">(.*?)</pre>', done.stdout)
     assert written, done.stderr[-2000:]
-    found = json.loads(
-        written.group(1).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
-    )
+    found = json.loads(html.unescape(written.group(1)))
     assert found["wrong"] == []
     assert found["ready"] == "yes"
     assert found["up"] == ["bound", "ekf", "dead_reckoning"]

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from coloc_env.geometry import rotation_matrix
-from training.evaluation.files import FIGURES, NAMES, REPORT, write
+from training.evaluation.files import FIGURES, WRITTEN, write
 from training.evaluation.results import Evaluation
 from training.evaluation.tables import COLUMNS, csv_text, markdown, rows
 from training.evaluation.tum import folder_names, quaternions, tum_text
@@ -29,7 +29,7 @@ def unscored(results: Evaluation) -> Evaluation:
 
 def test_folder(made_up: Evaluation, tmp_path: Path) -> None:
     write(made_up, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == set(NAMES) - {*FIGURES, REPORT}
+    assert {path.name for path in tmp_path.iterdir()} == set(WRITTEN) - set(FIGURES)
     text = (tmp_path / "results.json").read_text(encoding="utf-8")
     summary = json.loads(text, parse_constant=refuse)
     assert summary == made_up.summary

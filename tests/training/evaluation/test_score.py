@@ -12,10 +12,11 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from agents.tasks import make_task
+from agents.tasks.rules import Seen
 from agents.tasks.runner import rollout
-from agents.tasks.task import Seen
 from training.cli.command import app
 from training.evaluation.score import FIRST_SEED, bootstrap, interquartile_mean, score
+from training.evaluation.task_policies import from_pettingzoo
 
 
 def by_observation(seen: Seen) -> Tensor:
@@ -90,3 +91,40 @@ def test_tasks_are_listed_with_their_heuristics() -> None:
     assert one.exit_code == 0, one.output
     assert "drift" in one.output
     assert "frontier" in one.output
+
+
+def test_any_pettingzoo_policy_scores() -> None:
+    """One for a single world, by agents' names, scores as the same one for many at once."""
+
+    class Ahead:
+        def __call__(self, observations: dict[str, Any], infos: dict[str, Any]) -> dict[str, Any]:
+            return {a: np.array([1.0, -o[1]], np.float32) for a, o in observations.items()}
+
+    task = "convoy-v0:horizon=10"
+    found = score(task, from_pettingzoo(Ahead), 5)
+    assert found["returns"] == score(task, by_observation, 5)["returns"]
+
+    def silent(observations: dict[str, Any], infos: dict[str, Any]) -> dict[str, Any]:
+        assert all(info["action_mask"][0] == 1 for info in infos.values())
+        return {}
+
+    with pytest.raises(ValueError, match="no action for uav_0"):
+        score("schedule-v0:horizon=3", from_pettingzoo(lambda: silent), 4)
+
+
+def test_several_seeds_have_an_interval_of_their_own() -> None:
+    found = score("convoy-v0:horizon=25", "all_go,half_speed,leapfrog,idle", 5)
+    each = [
+        score("convoy-v0:horizon=25", name, 5)["return"]
+        for name in ("all_go", "half_speed", "leapfrog", "idle")
+    ]
+    assert found["seeds"]["returns"] == pytest.approx(each)
+    assert found["seeds"]["interquartile_mean"] == pytest.approx(trim_mean(each, 0.25))
+    low, high = found["seeds"]["interval_95"]
+    assert low < found["seeds"]["interquartile_mean"] < high
+    assert found["return"] == pytest.approx(np.mean(each))
+
+
+def test_scores_are_of_the_true_error_whatever_was_trained_on() -> None:
+    trained = score("track-v0:horizon=6:reward=sigma:obs=dict", "pairs", 5)
+    assert trained["returns"] == score("track-v0:horizon=6", "pairs", 5)["returns"]

@@ -153,14 +153,18 @@ def cases(better: bool) -> dict[tuple[str, str], Runs]:
         early, late = late, early
     return {
         key(1, "pf"): runs(world),
-        key(1, "hpff"): runs(1.01 * world, late),
-        key(1, "nnhpff"): runs(world, none),
+        key(1, "hpff:bank=false"): runs(1.01 * world, late),
+        key(1, "nnhpff:bank=false"): runs(world, none),
         key(2, "pf"): runs(world),
-        key(2, "hpff"): runs((1.5 if better else 0.5) * world, often if better else none),
-        key(2, "nnhpff"): runs((1.01 if better else 1.5) * world, none if better else often),
+        key(2, "hpff:bank=false"): runs(
+            (1.5 if better else 0.5) * world, often if better else none
+        ),
+        key(2, "nnhpff:bank=false"): runs(
+            (1.01 if better else 1.5) * world, none if better else often
+        ),
         key(3, "pf"): runs(world + (1.0 if better else 0.1) * corner),
-        key(3, "hpff"): runs(world + (0.71 if better else 1.5) * corner, late),
-        key(3, "nnhpff"): runs(world + (0.7 if better else 1.7) * corner, early),
+        key(3, "hpff:bank=false"): runs(world + (0.71 if better else 1.5) * corner, late),
+        key(3, "nnhpff:bank=false"): runs(world + (0.7 if better else 1.7) * corner, early),
     }
 
 
@@ -180,7 +184,7 @@ def test_the_opposite_contradicts_them() -> None:
 
 
 def test_what_was_not_run_is_not_judged() -> None:
-    some = {k: one for k, one in cases(True).items() if k[1] != "nnhpff"}
+    some = {k: one for k, one in cases(True).items() if k[1] != "nnhpff:bank=false"}
     for each in judged(some):
         assert (each.verdict == UNKNOWN) == ("NN-HPFF" in each.claim.words)
 
@@ -208,7 +212,12 @@ def test_every_scenario_of_the_plan_can_be_built(tmp_path: Path) -> None:
 
 def test_a_small_page(tmp_path: Path) -> None:
     variants = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
-    agents = ["pf", "hpff", "nnhpff", "nnhpff:main=pf@particles=500:threshold=1"]
+    agents = [
+        "pf",
+        "hpff:bank=false",
+        "nnhpff:bank=false",
+        "nnhpff:bank=false:main=pf@particles=500:threshold=1",
+    ]
     chosen: dict[str, Any] = {"agents": agents, "variants": variants, "steps": 25}
     reproduce(nnhpff(), Settings(tmp_path, 2, **chosen))
     text = (tmp_path / "page.md").read_text()

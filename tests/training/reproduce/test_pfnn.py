@@ -399,6 +399,23 @@ def test_unknown_studies_are_named(tmp_path: Path) -> None:
     assert "unknown study 'pfn' (did you mean 'pfnn'?)" in done.stderr
 
 
+def test_a_replacement_that_was_cut_short_is_completed_before_it_is_read(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    journal = out / ".out.journal"
+    for folder in ("new", "old"):
+        (journal / folder).mkdir(parents=True)
+    plan = {"remove": [], "place": ["results.json"]}
+    (journal / "plan.json").write_text(json.dumps(plan))
+    content = {"study": "A", "source": "B", "sections": [], "not_run": []}
+    facts = {"versions": {}, "commit": "", "command": "c", "date": "d", "runs": 1, "seed": 0}
+    content["provenance"] = facts | {"machine": "m"}
+    (journal / "new" / "results.json").write_text(json.dumps(content))
+    done = coloc("--out", out, "--page", tmp_path / "x.md")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "x.md").read_text().startswith("# A, reproduced")
+    assert [path.name for path in out.iterdir()] == ["results.json"]
+
+
 @pytest.mark.parametrize("content", ["", "[]", "{}", "[" * 100_000, '{"study": 1'])
 def test_what_is_no_results_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text(content)

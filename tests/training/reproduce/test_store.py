@@ -1,5 +1,6 @@
 """The store: nothing is lost, nothing is mixed; and what a result is said to depend on."""
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -94,6 +95,21 @@ def test_damaged_files_are_never_taken(store: Store) -> None:
         assert "\n" not in str(error.value)
     path.write_bytes(whole)
     assert store.has(name, SETTINGS)
+
+
+def test_whoever_forges_a_checksum_gets_one_line(store: Store) -> None:
+    path, name = save(store), "nlos/ekf:robust=huber-0+2"
+    whole, rng = path.read_bytes()[:-32], np.random.default_rng(777)
+    lines = []
+    for _ in range(250):
+        archive = _mutated(whole, rng)
+        path.write_bytes(archive + hashlib.sha256(archive).digest())
+        try:
+            store.load(name, SETTINGS)
+        except ValueError as error:
+            lines.append(str(error))
+    assert len(lines) > 200
+    assert all(path.name in line and "\n" not in line for line in lines)
 
 
 def test_numpy_reads_the_files_too(store: Store) -> None:

@@ -150,24 +150,24 @@ def _player(runs: Runs) -> dict[str, Any]:
     frames = np.unique(np.linspace(0, steps - 1, min(steps, _FRAMES)).round().astype(int))
     estimates, roots = {}, {}
     for name, one in runs.methods.items():
-        estimates[name] = _packed(_in_space(runs.truth[frames] + one.offset[frames]))
-        roots[name] = _packed(_axes(one.covariance[frames]))
+        estimates[name] = _packed(in_space(runs.truth[frames] + one.offset[frames]))
+        roots[name] = _packed(half_axes(one.covariance[frames]))
     return {
         "frames": len(frames),
         "steps": frames.tolist(),
         "time": _numbers(frames * runs.dt),
-        "truth": _packed(_in_space(runs.truth[frames])),
+        "truth": _packed(in_space(runs.truth[frames])),
         "scored": base64.b64encode(runs.scored[0, frames].astype(np.uint8).tobytes()).decode(),
         "estimates": estimates,
         "axes": roots,
         "links": base64.b64encode(np.packbits(runs.links[frames].reshape(-1)).tobytes()).decode(),
         "low": [*runs.low, 0.0][:3],
         "high": [*runs.high, 0.0][:3],
-        "places": {name: _numbers_of(_in_space(values)) for name, values in runs.places.items()},
+        "places": {name: _numbers_of(in_space(values)) for name, values in runs.places.items()},
     }
 
 
-def _axes(covariance: Floats) -> Floats:
+def half_axes(covariance: Floats) -> Floats:
     """Half axes of the ellipsoids that hold 95 % of a Gaussian, as columns [..., 3, 3] (m)."""
     dim = covariance.shape[-1]
     known = np.isfinite(covariance).all((-2, -1), keepdims=True)
@@ -179,7 +179,7 @@ def _axes(covariance: Floats) -> Floats:
     return out
 
 
-def _in_space(places: Floats) -> Floats:
+def in_space(places: Floats) -> Floats:
     """Positions with z = 0 in the plane."""
     if places.shape[-1] == 3:
         return places

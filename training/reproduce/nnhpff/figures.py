@@ -19,8 +19,13 @@ from training.reproduce.results import Results
 from training.reproduce.verdicts import interval
 
 # Colours that all eyes distinguish, the same in every figure.
-_COLOURS = {"pf": "#0072B2", "hpff": "#E69F00", "nnhpff": "#D55E00", "ekf": "#009E73"}
-_NAMES = {"pf": "PF", "hpff": "HPFF", "nnhpff": "NN-HPFF"}
+_COLOURS = {
+    "pf": "#0072B2",
+    "hpff:bank=false": "#E69F00",
+    "nnhpff:bank=false": "#D55E00",
+    "ekf": "#009E73",
+}
+_NAMES = {"pf": "PF", "hpff:bank=false": "HPFF", "nnhpff:bank=false": "NN-HPFF"}
 
 
 def learning(results: Results) -> Figure | None:
@@ -32,7 +37,7 @@ def learning(results: Results) -> Figure | None:
         return None
     samples = np.loadtxt(file, delimiter=",", ndmin=2)
     figure, ((axes,),) = panels(1, 1, (6.0, 3.2), "Learning the failures of the particle filter")
-    axes.plot(samples[:, 0] / 1e3, samples[:, 1], color=_COLOURS["nnhpff"], marker=".")
+    axes.plot(samples[:, 0] / 1e3, samples[:, 1], color=_COLOURS["nnhpff:bank=false"], marker=".")
     axes.set(xlabel="samples (thousands)", ylabel="cross-entropy", yscale="log")
     return figure
 
@@ -65,7 +70,10 @@ def case(number: int, results: Results) -> Figure | None:
         title=f"b  error, mean of {len(first_one.error)} runs",
     )
     error.set_ylim(0.0, _calm_top([one.error.mean((0, 2)) for one in there.values()]))
-    for axes, agent, letter in ((first, "hpff", "c"), (second, "nnhpff", "d")):
+    for axes, agent, letter in (
+        (first, "hpff:bank=false", "c"),
+        (second, "nnhpff:bank=false", "d"),
+    ):
         axes.set_title(f"{letter}  resets of {_NAMES[agent]}")
         axes.set(xlabel="time (s)", ylabel="runs reset (%)", xlim=(0, time[-1]), ylim=(0, 100))
         if agent in there:

@@ -16,8 +16,14 @@ from training.reproduce.settings import Settings
 from training.reproduce.work import Cell, Training, Variant
 
 TITLE = "Neural-network-aided hybrid particle/FIR filter, *Electronics* 2025, 14(21), 4346"
-METHODS = ("pf", "hpff", "nnhpff")
-BESIDE = ("emvf", "ekf", "pf:tempering=true", "hpff:main=ekf", "nnhpff:main=ekf")
+METHODS = ("pf", "hpff:bank=false", "nnhpff:bank=false")
+BESIDE = (
+    "emvf",
+    "ekf",
+    "pf:tempering=true",
+    "hpff:bank=false:main=ekf",
+    "nnhpff:bank=false:main=ekf",
+)
 CASES = {
     1: "case 1: noise known",
     2: "case 2: R underestimated",
@@ -26,8 +32,8 @@ CASES = {
 MEMORIES, QUANTILES = (2, 5, 10), (0.95, 0.99)
 KIDNAPPED_AT, INDOOR_KIDNAPPED_AT = 18.0, 30.0  # s
 _INDOOR = (("anchors", 4), ("horizon", 600))
-INDOOR_METHODS = ("pfnn", "hpff:main=pfnn", "nnhpff:main=pfnn")
-INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:main=ekf")
+INDOOR_METHODS = ("pfnn", "hpff:bank=false:main=pfnn", "nnhpff:bank=false:main=pfnn")
+INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:bank=false:main=ekf")
 PATIENT = "patience=4"  # steps: longer than an outlier stays in the FIR filter's window
 FIRST_CORNER = 100  # step
 SETTLED = 20  # step from which a filter's start is over
@@ -118,7 +124,7 @@ def sensitivity(steps: int | None = None) -> list[Planned]:
     """How the verdicts move with σ, M, Q and the χ² quantile."""
     found: list[Planned] = []
     for number in CASES:
-        own = (f"hpff:quantile={q:g}" for q in QUANTILES)
+        own = (f"hpff:bank=false:quantile={q:g}" for q in QUANTILES)
         longer = (f"{a}:auxiliary=emvf@memory={m}" for a in METHODS[1:] for m in MEMORIES)
         found.append((case(number, steps), (*own, *longer)))
         for std in (0.1, 0.4):
@@ -135,7 +141,7 @@ def sensitivity(steps: int | None = None) -> list[Planned]:
 def kidnapping(steps: int | None = None) -> list[Planned]:
     """The robot, and half a team, are put somewhere else."""
     half = (("kidnap_at", INDOOR_KIDNAPPED_AT), ("kidnapped", (0, 1, 2)), *_INDOOR)
-    beside = ("ekf", "pf:tempering=true", "nnhpff:main=ekf")
+    beside = ("ekf", "pf:tempering=true", "nnhpff:bank=false:main=ekf")
     return [
         (case(1, steps, kidnap_at=KIDNAPPED_AT), (*METHODS, *beside)),
         (case(3, steps, kidnap_at=KIDNAPPED_AT), (*METHODS, *beside)),
@@ -217,7 +223,7 @@ def kidnapped_uavs(variant: Variant) -> slice:
 
 def _open_loop(main: str) -> str:
     """A filter that is watched by the network and never restarted."""
-    return f"nnhpff:main={main.replace(':', '@')}:threshold=1"
+    return f"nnhpff:bank=false:main={main.replace(':', '@')}:threshold=1"
 
 
 def _variant(kind: str, text: str, steps: int | None) -> Variant:

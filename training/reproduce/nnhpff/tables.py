@@ -24,7 +24,7 @@ from training.reproduce.results import Results, Runs
 from training.reproduce.settings import Settings
 from training.reproduce.tables import DASH, Table, by_agent, lost, nees, shortened, with_ends
 
-PAPER_MS = {"pf": 4.15, "hpff": 4.55, "nnhpff": 7.01}
+PAPER_MS = {"pf": 4.15, "hpff:bank=false": 4.55, "nnhpff:bank=false": 7.01}
 THRESHOLD = 0.5  # of the probability, beyond which the paper restarts
 _Places = Mapping[str, Mapping[str, Runs]]
 

@@ -1,0 +1,1 @@
+"""Calibration of a recording's sensors: noise, biases, delays, places and scales."""

@@ -1,0 +1,99 @@
+"""``coloc recordings``."""
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.cli.options import Data, Seed, Threads, require_seed
+from training.cli.terminal import progress, show
+
+
+def recordings(
+    agents: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,C",
+            help="Measure these agents on every recording (**default**: the table's in docs).",
+        ),
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Only these datasets; none: all.")
+    ] = None,
+    runs: Annotated[int, typer.Option(help="Draws of the prior, seeded SEED, SEED + 1, …")] = 3,
+    seed: Seed = 0,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the table as JSON.")
+    ] = None,
+    leave_one_out: Annotated[
+        bool,
+        typer.Option(
+            "--leave-one-out",
+            help="For each dataset, which agent is best on the *others*, and its ratio to the "
+            "better of **ekf** and **ekf:robust=huber** on it.",
+        ),
+    ] = False,
+    threads: Threads = 1,
+    data: Data = None,
+) -> None:
+    """List the recordings in the data folder, or measure agents on all of them.
+
+    A line a recording: the scenario that replays it, and whether constants were chosen on it.
+
+    **Examples**
+
+    coloc recordings --data ~/recordings
+
+    coloc recordings --agents ekf,ekf:robust=huber,ekf_trust --runs 3 --out recordings.json
+    """
+    require_seed(seed)
+    if runs < 1:
+        raise ValueError(f"--runs {runs} is not allowed: at least 1")
+    if data is not None:
+        os.environ["COLOC_DATA"] = str(data)
+    if agents is None:
+        _list()
+        return
+    from training.threads import use_threads
+
+    use_threads(threads)
+    from training.evaluation import recordings as all_of_them
+    from training.evaluation.evaluate import split_agents
+
+    names = all_of_them.AGENTS if agents == "default" else tuple(split_agents(agents))
+    figures: dict[str, dict[str, dict[str, object]]] = {}
+    tuned: dict[str, bool] = {}
+    with progress() as bars:
+        for one in all_of_them.recorded():
+            if only is not None and one.dataset not in only.split(","):
+                continue
+            scenario = one.scenario()
+            name = f"{one.dataset}/{one.sequence}"
+            tuned[name] = one.sequence in scenario.tuned_on
+            figures[name] = all_of_them.measure(scenario, names, runs, seed, bars)
+            command = f"coloc recordings --agents {agents} --runs {runs} --seed {seed}"
+            table = all_of_them.table(
+                figures, tuned, names, runs, seed, command, "measured by this command"
+            )
+            if out is not None:  # what is measured so far, should the rest be stopped
+                text = json.dumps(table, indent=1, ensure_ascii=False)
+                out.write_text(text + "\n", encoding="utf-8")
+    show(table["header"], table["rows"])
+    if leave_one_out:
+        chosen = all_of_them.chosen_elsewhere(figures, names)
+        show(
+            ["dataset", "chosen on the others", "× best classical"],
+            [[key, agent, f"{ratio:.3f}"] for key, (agent, ratio) in chosen.items()],
+        )
+
+
+def _list() -> None:
+    from training.evaluation.recordings import recorded
+
+    lines = []
+    for one in recorded():
+        tuned = "constants chosen on it" if one.sequence in one.scenario().tuned_on else ""
+        lines.append([f"{one.dataset}/{one.sequence}", one.scenario_name, tuned])
+    show(["recording", "scenario", ""], lines)

@@ -1,0 +1,1 @@
+"""Learning on tasks: decisions in their worlds, rewards to train on, one file per algorithm."""
