@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.factor_graph.chain import Chain, smooth
+from agents.factor_graph.chain import Chain, Smoothed, smooth
 from agents.factor_graph.condensed import arrived, condensed, tie
 from agents.kalman.filter import elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
@@ -114,7 +114,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         newest = process.propagate(belief.states[:, :, -1], process.inputs(observation), dt)
         x = torch.cat((belief.states[:, :, 1:], newest.unsqueeze(2)), 2)
         for _ in range(self.iterations):
-            at, found = x, smooth(self._chain(x, belief, leaves, heard))
+            at, found = x, self._solved(x, belief, leaves, heard)
             x = process.boxplus(x, found.mean)
         prior = process.boxplus(at[:, :, 1], found.next_mean)
         state, covariance = x[:, :, -1], found.covariance[..., -1, :, :]
@@ -139,34 +139,38 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
 
     # ---------------------------------------------------------------- own factors
 
-    def _chain(
+    def _solved(
         self,
         x: Float64[Tensor, "B N W S"],
         belief: SmootherBelief,
         leaves: Observation,
         heard: Float64[Tensor, "B N W H"],
-    ) -> Chain:
-        """All factors of the window linearized about its states."""
-        process, w = self.process, self.size
-        u = process.inputs(leaves).expand(*x.shape[:3], -1)[:, :, 1:]
-        last = torch.arange(2 - w, 1, device=x.device)
-        dt = elapsed(process, belief.step.unsqueeze(-1) + last).double()
-        f, q = process.linearize(x[:, :, :-1], u, dt)
-        ahead = process.propagate(x[:, :, :-1], u, dt)
-        blocks = [m.linearize(process, x, leaves, self._neighbours(heard)) for m in self.own]
-        e = process.error_size
+    ) -> Smoothed:
+        """The window's graph, linearized about its states and solved."""
+        blocks = [m.linearize(self.process, x, leaves, self._neighbours(heard)) for m in self.own]
+        e = self.process.error_size
         precision, vector = x.new_zeros(*x.shape[:3], e, e), x.new_zeros(*x.shape[:3], e)
         if blocks:
             precision, vector = information(blocks, [self._trust(block) for block in blocks])
-        return Chain(
-            process.boxminus(belief.prior, x[:, :, 0]),
-            belief.prior_covariance,
-            f,
-            process.boxminus(ahead, x[:, :, 1:]),
-            q,
-            precision,
-            vector,
-        )
+        motion = self._motion(x, belief, leaves)
+        return smooth(Chain(motion[0], belief.prior_covariance, *motion[1:], precision, vector))
+
+    def _motion(
+        self, x: Float64[Tensor, "B N W S"], belief: SmootherBelief, leaves: Observation
+    ) -> tuple[
+        Float64[Tensor, "B N E"],
+        Float64[Tensor, "B N W-1 E E"],
+        Float64[Tensor, "B N W-1 E"],
+        Float64[Tensor, "B N W-1 E E"],
+    ]:
+        """The prior's mean, and F, d and Q between the window's states, about them."""
+        process = self.process
+        u = process.inputs(leaves).expand(*x.shape[:3], -1)[:, :, 1:]
+        last = torch.arange(2 - self.size, 1, device=x.device)
+        dt = elapsed(process, belief.step.unsqueeze(-1) + last).double()
+        f, q = process.linearize(x[:, :, :-1], u, dt)
+        ahead = process.boxminus(process.propagate(x[:, :, :-1], u, dt), x[:, :, 1:])
+        return process.boxminus(belief.prior, x[:, :, 0]), f, ahead, q
 
     def _trust(self, block: Block) -> Trust:
         return Trust(huber_weights(block)) if self.robust else Trust()

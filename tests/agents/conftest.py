@@ -122,6 +122,7 @@ CHOSEN = {
     "mappo": ("default", "slots", "plane"),
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
     "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
+    "dfgo_central": ("default", "imu_bias", "plane"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),

@@ -161,6 +161,8 @@ def test_the_first_step_predicts_nothing(case: SimpleNamespace, tools: SimpleNam
 def test_without_measurements_the_first_estimate_is_the_prior(
     case: SimpleNamespace, tools: SimpleNamespace
 ) -> None:
+    if "variant=paper" in case.name:
+        pytest.skip("starts anywhere in the arena, whatever the prior")
     if isinstance(case.localizer, PolicyAgent):
         pytest.skip("what a policy says then is what it has learned")
     if isinstance(case.localizer, MinimumVarianceFir | Snapshot | RelativeTeam):

@@ -178,6 +178,19 @@ def test_in_a_linear_world_it_is_the_kalman_filter(window: int, tools: SimpleNam
         torch.testing.assert_close(one.covariance, other.covariance, rtol=1e-6, atol=1e-10)
 
 
+def test_the_teams_graph_is_the_joint_kalman_filter(tools: SimpleNamespace) -> None:
+    """But for linearization: where landmarks pin attitudes, ranges are all but linear."""
+    scenario = make_scenario("indoor-v0", landmarks=30)
+    run = tools.play(make("dfgo_central:robust=none:window=6", scenario), scenario, [0, 1], 25)
+    joint = tools.replay(make("ekf_joint", scenario), run.observations)
+    apart = (run.position[-1] - joint.position[-1]).norm(dim=-1)
+    sigma = joint.estimates[-1].covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    assert (apart < 0.15 * sigma).all()
+    torch.testing.assert_close(
+        run.estimates[-1].covariance, joint.estimates[-1].covariance, rtol=0.05, atol=2e-5
+    )
+
+
 def test_the_room_is_localized_consistently(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0")
     found = tools.score("dfgo:window=8", scenario, 6, 40)

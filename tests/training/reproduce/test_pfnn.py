@@ -226,7 +226,7 @@ def test_tables_have_both_sides() -> None:
     assert line[3].startswith("63.")
     assert (line[6], line[7], line[8]) == ("178", "1.000", "178.00")
     lines = tables._figure_2(run).rows
-    assert [line[0] for line in lines] == [f"[{a}, {b}]" for a, b in paper.RANGES]
+    assert [line[0] for line in lines] == 2 * [f"[{a}, {b}]" for a, b in paper.RANGES]
     assert next(line for line in lines if line[1] == "`pfnn`")[3] == "–"
 
 
@@ -366,7 +366,7 @@ def test_the_paper_part(tmp_path: Path) -> None:
 def test_figures_2_to_8(monkeypatch: pytest.MonkeyPatch) -> None:
     from training.reproduce.pfnn.figures import FIGURES
 
-    found: Any = study({agent: PAPERS[agent] for agent in (*TABLE_AGENTS, *ABLATION)})
+    found: Any = study({a: PAPERS[a] for a in (*TABLE_AGENTS, *ABLATION) if a in PAPERS})
     assert [name for name, drawing in FIGURES.items() if drawing(found) is None] == []
     assert {name for name, drawing in FIGURES.items() if drawing(Study({})) is None} == set(FIGURES)
 

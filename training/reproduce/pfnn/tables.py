@@ -16,6 +16,7 @@ from training.reproduce.pfnn.plan import (
     ONLINE,
     ORACLE,
     PRINTED,
+    PRINTED_ABLATION,
     SWEEP,
     particles,
     redrawn,
@@ -164,12 +165,14 @@ def _table_5(results: Results) -> Table:
 def _figure_2(results: Results) -> Table:
     """The ablation in numbers: RMSE and largest error (m), particles; paired with [0.4, 1.0]."""
     header = ["range", "agent", "RMSE", "minus that of [0.4, 1.0]", "largest error", "particles"]
-    rows, own = [], results.get(DEFAULT, "pfnn")
-    for agent, span in ABLATION.items():
+    rows = []
+    for agent, span in (ABLATION | PRINTED_ABLATION).items():
         cells, one = [DASH] * 4, results.get(DEFAULT, agent)
+        proposed = PRINTED["pfnn"] if agent in PRINTED_ABLATION else "pfnn"
+        own = results.get(DEFAULT, proposed)
         if one is not None:
             apart = DASH
-            if agent != "pfnn" and own is not None:
+            if agent != proposed and own is not None:
                 apart = signed(metrics.paired_difference(rmse(one), rmse(own)), "mm", scale=1e3)
             cells = [spread(rmse(one)), apart, spread(largest(one)), spread(particles(one))]
         rows.append([f"[{span[0]}, {span[1]}]", f"`{agent}`", *cells])
