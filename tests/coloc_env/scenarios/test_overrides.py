@@ -24,6 +24,8 @@ RANGES: dict[str, Any] = {
     "uwb_impulse": 0.5,
     "uwb_impulse_size": 99.0,
     "uwb_dropout": 0.5,
+    "range_bias_std": 9.0,
+    "range_bias_time": 5.0,
 }
 DELAYED = {**RANGES, "uwb_delay": 1}
 LANDMARKS: dict[str, Any] = {
@@ -150,6 +152,7 @@ CHANGED: dict[str, dict[str, Any]] = {
 RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_bias": {"nlos": 0.5},
     "nlos_kind": {"nlos": 0.5},
+    "range_bias_time": {"range_bias_std": 1.0},
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
