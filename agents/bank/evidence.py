@@ -27,7 +27,7 @@ class BankOptions(Group):
     title: ClassVar[str] = "bank"
 
     bank: bool = True
-    forgetting: OpenShare = 0.98
+    forgetting: OpenShare = 0.995
     degrees: Factor = 4.0
     restart: Annotated[float, Quantity("", below=0.0)] = -10.0
 
@@ -37,7 +37,8 @@ def predictive_score(
 ) -> Float64[Tensor, "B N"]:
     """ℓ = Σ −½ log|S| − ½ (ν + k) log(1 + d²/ν) over all that was measured, S = H P Hᵀ + R and
     d² = rᵀ S⁻¹ r: log of Student's t of the innovations, without what no filter changes. ``blocks``
-    are linearized at the prediction, whose covariance P is."""
+    are linearized at the prediction, whose covariance P is. A number that two UAVs hold counts half
+    for each."""
     total = covariance.new_zeros(covariance.shape[:-2])
     for block in blocks:
         terms, pivots = innovation_terms(block, covariance)
@@ -45,7 +46,8 @@ def predictive_score(
         distance = sum(terms[1:], terms[0])
         logarithm = sum((pivot.log() for pivot in pivots[1:]), pivots[0].log())  # log|S|
         each = -0.5 * (logarithm + (degrees + k) * (distance / degrees).log1p())
-        total = total + torch.where(block.mask, each, 0.0).sum(-1)
+        share = 0.5 if block.mutual else 1.0
+        total = total + share * torch.where(block.mask, each, 0.0).sum(-1)
     return total
 
 

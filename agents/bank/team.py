@@ -111,5 +111,6 @@ def range_score(inputs: StepInput, std: float, degrees: float) -> Float64[Tensor
         jacobian=nothing,
         variance=variance,
         mask=links.mask,
+        mutual=True,
     )
     return predictive_score([block], residual.new_zeros(*residual.shape[:2], 0, 0), degrees)

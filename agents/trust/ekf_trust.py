@@ -14,11 +14,12 @@ from coloc_env.scenario import Believed
 class TrustingEkf(CooperativeEkf):
     """Cooperative EKF with learned trust in every landmark, bearing and range.
 
-    Two Huber iterations (five where the prior is broad), then one with the weights and range biases
-    that the networks give to what they see, where those are no larger than Huber's. A UAV speaks
-    with this branch while it predicts better than one with Huber's weights alone; ``bank=false``
-    is the networks' alone, without Huber's cap. ``weights``: a checkpoint's name or path, ``none``,
-    or ``auto``, which is ``trust_bank``, or without a bank ``trust``.
+    Huber iterations (three more where the prior is broad), then one with the weights and range
+    biases that the networks give to what they see, where those are no larger than Huber's. A UAV
+    speaks with this branch while it predicts no worse than one with Huber's weights alone;
+    ``bank=false`` is the networks' alone, without Huber's cap. ``weights``: a checkpoint's name or
+    path, ``none``, or ``auto``: ``trust_bank``, without a bank ``trust``. ``iterations``: none: two
+    in a bank, as ``ekf`` has them, three without.
     """
 
     name = "ekf_trust"
@@ -28,11 +29,11 @@ class TrustingEkf(CooperativeEkf):
         believed: Believed,
         *,
         weights: str = "auto",
-        iterations: PositiveCount = 3,
+        iterations: PositiveCount | None = None,
         bank: BankOptions = BankOptions(),  # noqa: B008
         **options: Any,
     ) -> None:
-        super().__init__(believed, iterations=iterations, **options)
+        super().__init__(believed, iterations=iterations or (2 if bank.bank else 3), **options)
         self.screen = learned_screen(self.process, self.models, weights, bank.bank, options)
 
     @classmethod

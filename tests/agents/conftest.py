@@ -191,7 +191,7 @@ def build(name: str, scenario: Scenario) -> Localizer:
     if "weights" in known:
         few["weights"] = "none"
     if "main" in known:
-        few["main"] = f"pf@particles={PARTICLES}"
+        few["main"] = f"pf@particles={PARTICLES}@tempering=true"
     return make(name, scenario, **few)
 
 

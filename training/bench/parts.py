@@ -48,6 +48,8 @@ _FUNCTIONS = {  # where a name is looked up: what its time is called
     "agents.trust.screen.innovation": "trust features",
     "agents.trust.screen.features": "trust features",
     "agents.trust.screen.huber_weights": "Huber weights",
+    "agents.bank.branches.huber_weights": "Huber weights",
+    "agents.bank.branches.predictive_score": "predictive score",
 }
 _METHODS = {  # of a localizer and what it is made of
     "process.propagate": "prediction",
@@ -56,6 +58,10 @@ _METHODS = {  # of a localizer and what it is made of
     "log_correction": "corrector network",
     "screen.network.trust_vectors": "trust networks",
     "screen.network.trust_ranges": "trust networks",
+    "filter.screen.candidate.network.trust_vectors": "trust networks",
+    "filter.screen.candidate.network.trust_ranges": "trust networks",
+    "filter.resampling.weigh": "weights",
+    "filter.resampling.resample_few": "resampling",
 }
 
 

@@ -27,6 +27,14 @@ def recordings(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the table as JSON.")
     ] = None,
+    leave_one_out: Annotated[
+        bool,
+        typer.Option(
+            "--leave-one-out",
+            help="For each dataset, which agent is best on the *others*, and its ratio to the "
+            "better of **ekf** and **ekf:robust=huber** on it.",
+        ),
+    ] = False,
     threads: Threads = 1,
     data: Data = None,
 ) -> None:
@@ -73,6 +81,12 @@ def recordings(
                 text = json.dumps(table, indent=1, ensure_ascii=False)
                 out.write_text(text + "\n", encoding="utf-8")
     show(table["header"], table["rows"])
+    if leave_one_out:
+        chosen = all_of_them.chosen_elsewhere(figures, names)
+        show(
+            ["dataset", "chosen on the others", "× best classical"],
+            [[key, agent, f"{ratio:.3f}"] for key, (agent, ratio) in chosen.items()],
+        )
 
 
 def _list() -> None:

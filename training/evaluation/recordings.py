@@ -19,7 +19,7 @@ from training.evaluation.tables import short
 
 AGENTS = (
     *("ekf", "ekf:robust=huber", "ekf_trust:bank=false", "ekf_trust"),
-    *("map", "hpff:main=pf@particles=1000", "nnhpff:main=pf@particles=1000"),
+    *("map", "hpff:main=ekf", "nnhpff:main=ekf"),
 )
 CLASSICAL = AGENTS[:2]
 _DASH = "–"
@@ -108,9 +108,7 @@ def table(
     """A measured table (``docs/results/measured``): a line a recording."""
     rows = []
     for name, by_agent in figures.items():
-        known = [by_agent[agent] for agent in CLASSICAL if "rmse" in by_agent.get(agent, {})]
-        best = min((one["rmse"] for one in known), default=float("nan"))
-        cells = [_cell(by_agent[agent], best) for agent in agents]
+        cells = [_cell(by_agent[agent], _best(by_agent)) for agent in agents]
         rows.append([f"{name}{' ᵗ' if tuned[name] else ''}", *cells])
     return {
         "title": "Every recording",
@@ -125,11 +123,44 @@ def table(
     }
 
 
+def chosen_elsewhere(
+    figures: Mapping[str, Mapping[str, Mapping[str, Any]]], agents: Sequence[str]
+) -> dict[str, tuple[str, float]]:
+    """By dataset: the agent with the least mean log ratio to the best classical filter on the
+    recordings of all *other* datasets, and its mean ratio on those of this one. How far constants
+    carry that were chosen without it."""
+    ratios: dict[str, dict[str, list[float]]] = {}
+    for name, by_agent in figures.items():
+        best = _best(by_agent)
+        for agent in agents:
+            if agent not in CLASSICAL and "rmse" in by_agent[agent] and best < float("inf"):
+                ratio = float(np.log(by_agent[agent]["rmse"] / best))
+                ratios.setdefault(name.split("/")[0], {}).setdefault(agent, []).append(ratio)
+    found = {}
+    for dataset, here in ratios.items():
+        others = [one for other, one in ratios.items() if other != dataset]
+        if not others:
+            raise ValueError(f"only {dataset} was measured: another dataset is needed to choose on")
+        scores = {
+            agent: float(np.mean([np.mean(one[agent]) for one in others if agent in one]))
+            for agent in here
+        }
+        agent = min(scores, key=lambda name: scores[name])
+        found[dataset] = (agent, float(np.exp(np.mean(here[agent]))))
+    return found
+
+
+def _best(by_agent: Mapping[str, Mapping[str, Any]]) -> float:
+    """RMSE of the better classical filter; infinite where none serves."""
+    known = [one["rmse"] for name, one in by_agent.items() if name in CLASSICAL and "rmse" in one]
+    return min(known, default=float("inf"))
+
+
 def _cell(one: Mapping[str, Any], best: float) -> str:
     if "rmse" not in one:
         return _DASH
     text = short(one["rmse"])
-    if one["rmse"] <= 1.05 * best:
+    if one["rmse"] <= 1.05 * best < float("inf"):
         text = f"**{text}**"
     text += f" ({short(one['nees'])})"
     if one["lost"]:

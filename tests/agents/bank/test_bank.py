@@ -46,7 +46,7 @@ def series(run: Any, name: str) -> Tensor:
 def test_the_fallback_is_the_filter_with_hubers_weights(name: str, tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0", n_uavs=3, **HARD)
     alone = {
-        "ekf_trust": "ekf:robust=huber:iterations=3",
+        "ekf_trust": "ekf:robust=huber",
         "pf_trust": "apf:robust=huber:particles=40:bounds=30,60",
     }[name]
     few = ":particles=40:bounds=30,60" if name == "pf_trust" else ""
@@ -61,7 +61,7 @@ def test_the_fallback_is_the_filter_with_hubers_weights(name: str, tools: Simple
 def test_the_candidate_is_the_capped_filter(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0", n_uavs=3, **HARD)
     run = tools.play(make("ekf_trust", scenario), scenario, [0, 1], 12)
-    alone: Any = make("ekf_trust:bank=false:weights=trust_bank", scenario)
+    alone: Any = make("ekf_trust:bank=false:weights=trust_bank:iterations=2", scenario)
     alone.screen = Capped(alone.screen)
     expected = tools.replay(alone, run.observations)
     assert not series(run, "restarted").any()
@@ -113,7 +113,7 @@ def test_evidence_is_that_of_both_predictions(tools: SimpleNamespace) -> None:
             near = received(scenario.believed, seen)
             blocks = [model.linearize(process, x, seen, near) for model in models]
             scores.append(predictive_score(blocks, covariance, 4.0))
-        expected = accumulated(expected, *scores, 0.98)
+        expected = accumulated(expected, *scores, 0.995)
         torch.testing.assert_close(after.evidence, expected, rtol=0, atol=1e-4)
     assert expected.abs().min() > 1e-3
 
@@ -139,7 +139,7 @@ def test_no_trust_never_speaks_for_long_and_restarts(tools: SimpleNamespace) -> 
         rows = restarted[k]
         assert torch.equal(belief.candidate.state[rows], belief.fallback.state[rows])
         assert torch.equal(belief.candidate.covariance[rows], belief.fallback.covariance[rows])
-    huber = tools.replay(make("ekf:robust=huber:iterations=3", scenario), run.observations)
+    huber = tools.replay(make("ekf:robust=huber", scenario), run.observations)
     speaks = (evidence >= 0) & ~restarted
     assert speaks[10:].double().mean() < 0.3  # measured: 0.19, after restarts
     silent = evidence < 0

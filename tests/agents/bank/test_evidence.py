@@ -1,6 +1,7 @@
 """Evidence between two filters: Student's t by scipy, and the running sum in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,8 @@ def test_the_score_is_students_t(k: int, seed: int, degrees: float, scale: float
         expected += float(t.logpdf(r)) - constant
     found = float(predictive_score([one], covariance, degrees))
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    shared = float(predictive_score([replace(one, mutual=True)], covariance, degrees))
+    assert shared == pytest.approx(0.5 * expected, rel=1e-9, abs=1e-9)
 
 
 @given(st.floats(-20, 20), st.integers(1, 300), st.floats(0.5, 0.999))

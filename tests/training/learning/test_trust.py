@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from agents import make
 from agents.policies.adapters import LocalizerPolicy
+from agents.robust import Capped
 from agents.trust import TrustNetwork, TrustScreen
 from agents.trust import screen as trust_screen
 from agents.weights import load
@@ -84,7 +85,7 @@ def recorded() -> SimpleNamespace:
     network = Exact()
     load("trust", network)
     network.double()
-    ekf: Any = make("ekf_trust", scenario, weights="none")
+    ekf: Any = make("ekf_trust:bank=false", scenario, weights="none")
     ekf.learn(network)
     policy = LocalizerPolicy(ekf, scenario, record=partial(training._record, 0))
     batches = list(episode_collector(CoLocEnv(scenario, 2, seed=5), policy, 3, compact_obs=True))
@@ -167,6 +168,35 @@ def test_failed_uavs_do_not_count(recorded: SimpleNamespace) -> None:
     assert of(0.0, 0.0) != of(1.0, 0.0)
 
 
+def test_through_the_bank_it_is_the_learned_branch_that_is_run_again() -> None:
+    """A batch that the bank made: the loss is that of the candidate's own estimates."""
+    scenario = make_scenario("indoor-v0", n_uavs=3, horizon=9, nlos=0.5, false_matches=0.3)
+    bank: Any = make("ekf_trust", scenario)
+    network = bank.filter.screen.candidate.network
+    ekf: Any = make("ekf_trust:bank=false:iterations=2", scenario)
+    ekf.learn(network)
+    ekf.screen = Capped(ekf.screen)
+    beliefs: list[Any] = []
+
+    def watch(before: Any, after: Any, tensordict: Any) -> dict[str, Tensor]:
+        beliefs.append(after)
+        return training._record(0, before, after, tensordict)
+
+    policy = LocalizerPolicy(bank, scenario, record=watch)
+    batch = next(iter(episode_collector(CoLocEnv(scenario, 2, seed=5), policy, 3)))
+    loss = TrustLoss(network, [ekf], [scenario])
+    truth = batch["state"].unflatten(-1, (3, -1)).double()
+    losses = []
+    for t, belief in enumerate(beliefs[-3:]):
+        assert not belief.restarted.any()
+        candidate = belief.candidate
+        offset = candidate.state[..., :3] - truth[:, t, :, :3]
+        losses.append(negative_log_likelihood(offset, candidate.covariance[..., :3, :3]))
+    assert float(loss(batch)["loss_trust"]) == pytest.approx(
+        float(torch.stack(losses).mean()), rel=1e-4
+    )
+
+
 # ---------------------------------------------------------------- epochs
 
 
@@ -179,7 +209,7 @@ def test_an_epoch_has_every_variant_in_worlds_of_its_own(
     priors = set()
     for epoch, share in ((0, 1.0), (1, 0.05)):
         collector = made.collector.make(epoch)
-        assert [group["lr"] for group in optimizer.param_groups] == [pytest.approx(2e-3 * share)]
+        assert [group["lr"] for group in optimizer.param_groups] == [pytest.approx(1e-3 * share)]
         batches = list(collector)
         collector.shutdown()
         assert [int(b["train", "variant"][0, 0]) for b in batches] == [0, 1, 0, 1]
@@ -239,10 +269,10 @@ def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     weights = runs.start("trust", options, tmp_path / "run", quiet)
     card = json.loads(weights.with_suffix(".json").read_text())
     assert card["kind"] == "trust"
-    assert card["features"] == list(TrustNetwork.features)
+    assert card["features"] == list(TrustNetwork(relative=True).features)
     assert card["training"] == "trust"
     assert card["command"].startswith("coloc train trust --set scenario=indoor-v0:n_uavs=3")
-    assert card["options"] == {"learning_rate": 2e-3, "seed": 0, **options}
+    assert card["options"] == {"learning_rate": 1e-3, "seed": 0, "start": "trust", **options}
     assert card["epochs"] == 1
     assert card["frames"] == 10 * len(VARIANTS)
     assert card["metrics"].keys() >= {"loss_trust", "grad_norm", "optim_steps"}
@@ -255,9 +285,9 @@ def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert all(0 < value < 0.2 for value in found.values())
 
     localizer: Any = make("ekf_trust", make_scenario("indoor-v0"), weights=str(weights))
-    assert isinstance(localizer.screen, TrustScreen)
+    assert isinstance(localizer.filter.screen.candidate, TrustScreen)
     fresh = TRAININGS["trust"](**options).module.state_dict()
-    trained = localizer.screen.network.state_dict()
+    trained = localizer.filter.screen.candidate.network.state_dict()
     assert any(not torch.equal(trained[name], fresh[name]) for name in fresh)
     assert all(value.isfinite().all() for value in trained.values())
 

@@ -15,6 +15,7 @@ from training.evaluation.metrics import Difference
 from training.evaluation.tables import short
 from training.reproduce.drawing import headline
 from training.reproduce.measures import rmse
+from training.reproduce.pfnn.bank import gain_table
 from training.reproduce.pfnn.plan import robust_agents, variants
 from training.reproduce.results import Results, Runs
 from training.reproduce.settings import Settings
@@ -129,6 +130,9 @@ def tables(results: Results) -> Iterator[Table]:
             cells = [_bold(values.get(agent), best) for agent in agents]
             rows.append([variant.title, *bound, *cells])
         yield Table(title, header, rows)
+    gains = gain_table(results)
+    if gains is not None:
+        yield gains
     header = ["variant", "agent", "runs", "bound", "RMSE (m)", "± runs", "after 10 s", "mean"]
     header += ["median", "max", "NEES", "particles", "lost UAVs", "diverged runs", "× bound"]
     header += [f"minus `{x}` (95 %)" for x in REFERENCES]
