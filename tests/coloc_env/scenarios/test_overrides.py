@@ -152,6 +152,7 @@ CHANGED: dict[str, dict[str, Any]] = {
 RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_bias": {"nlos": 0.5},
     "nlos_kind": {"nlos": 0.5},
+    "range_bias_time": {"range_bias_std": 1.0},
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
