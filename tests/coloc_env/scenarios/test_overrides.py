@@ -156,7 +156,6 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
-    "range_bias_time": {"range_bias_std": 0.5},
 }
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
 STEERED: dict[str, dict[str, Any]] = {
