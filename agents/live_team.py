@@ -60,7 +60,7 @@ class LiveTeam:
 
     def start_at(self, start: int, until: int) -> bool:
         """Make up the prior at the first step (ns); False while, of what came until now, it cannot
-        be told which way is up."""
+        be given which way is up."""
         if self._prior is None:
             if self.driver == "imu" and until < start + LEVEL:
                 return False

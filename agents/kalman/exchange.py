@@ -32,8 +32,8 @@ class ExchangeBelief(TensorClass):
 
     ``team``: the joint filter's belief at the last step to which no packet was missing, ``lag``
     steps ago; ``state`` and ``covariance``: the UAV's own, now. ``sensed``: the UAV's own packets.
-    ``known``: packets that have arrived. ``told``: what the UAVs knew at the ends of the last steps
-    that messages take, and ``sent``: the packets that they sent in these, the oldest first.
+    ``known``: packets that have arrived. ``reported``: what the UAVs knew at the ends of the last
+    steps that messages take, and ``sent``: the packets that they sent in these, the oldest first.
     ``gone``: UAVs that were waited for in vain, and are left out for good. ``bytes`` sent in the
     last step.
     """
@@ -44,7 +44,7 @@ class ExchangeBelief(TensorClass):
     covariance: Float[Tensor, "B N E E"]
     sensed: Float32[Tensor, "B N W F"]
     known: Bool[Tensor, "B N N W"]
-    told: Bool[Tensor, "B N D N W"]
+    reported: Bool[Tensor, "B N D N W"]
     sent: Bool[Tensor, "B N D N W"]
     gone: Bool[Tensor, "B N N"]
     bytes_sent: Float[Tensor, "B N"]
@@ -84,7 +84,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
             covariance=covariance,
             sensed=self.log.empty(observation, self.window),
             known=packets,
-            told=waiting,
+            reported=waiting,
             sent=waiting,
             gone=packets[..., 0],
             bytes_sent=x[..., 0] * 0,
@@ -96,7 +96,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         self, belief: ExchangeBelief, observation: Observation
     ) -> tuple[ExchangeBelief, Estimate]:
         log = self.log.appended(belief.sensed, observation)
-        known, sent, told = self._flooded(belief, log, observation)
+        known, sent, reported = self._flooded(belief, log, observation)
         full = belief.lag == self.window - 1
         gone = belief.gone | (full.unsqueeze(-1) & ~known[..., 0])
         heard = _unbroken(known, belief.lag) & ~gone.unsqueeze(-1)
@@ -115,7 +115,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
             covariance=rows[:, own, :, own].movedim(0, 1),
             sensed=log,
             known=known,
-            told=told,
+            reported=reported,
             sent=sent,
             gone=gone,
             bytes_sent=self._bytes(log, sent[:, :, -1]),
@@ -144,7 +144,7 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
     ) -> tuple[Bool[Tensor, "B N N W"], Bool[Tensor, "B N D N W"], Bool[Tensor, "B N D N W"]]:
         """Packets known after the step's messages, sent in the last steps, and what was known at
         the ends of the last steps, all with windows that end now."""
-        known, sent, told = (_older(x) for x in (belief.known, belief.sent, belief.told))
+        known, sent, reported = (_older(x) for x in (belief.known, belief.sent, belief.reported))
         n, links = known.shape[1], observation["links"] > 0
         eye = torch.eye(n, dtype=torch.bool, device=known.device)
         sane = log.isfinite().all(-1).unsqueeze(1)  # others are spared what is no number
@@ -152,14 +152,14 @@ class ExchangingEkf(Localizer[ExchangeBelief]):
         fresh[..., -1] = eye
         # What those that are heard had not got when they sent what is heard now; whether they have
         # got the newest packets, nobody can know yet.
-        lacked = (links[..., None, None] & ~told[:, :, 0].unsqueeze(1)).any(2)
+        lacked = (links[..., None, None] & ~reported[:, :, 0].unsqueeze(1)).any(2)
         lacked[..., known.shape[-1] - 1 - 2 * self.delay :] = False
         relayed = known & lacked
         sent = torch.cat((sent[:, :, 1:], ((fresh | relayed) & sane).unsqueeze(2)), 2)
         arrived = (links[..., None, None] & sent[:, :, 0].unsqueeze(1)).any(2)
         known = known | arrived
         known[..., -1] |= eye  # one's own, whatever it holds
-        return known, sent, torch.cat((told[:, :, 1:], known.unsqueeze(2)), 2)
+        return known, sent, torch.cat((reported[:, :, 1:], known.unsqueeze(2)), 2)
 
     def _run(
         self,
