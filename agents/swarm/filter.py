@@ -271,6 +271,15 @@ class SwarmFilter(Localizer[SwarmBelief]):
         distance = links.distance - delays.offsets(after.delay)
         return Links(torch.where(links.mask, distance, 0.0), links.mask), after
 
+    def decay_rate(
+        self,
+        noise: Float64[Tensor, "B N"],
+        fixed: Bool[Tensor, "B N"],
+        dt: Float64[Tensor, "B N"],
+    ) -> float | Float64[Tensor, "B 1"]:
+        """λ of w(τ) = exp(−λ (t − τ)) in 1/s, in a step with this process ``noise`` (m²)."""
+        return self.decay
+
     def _window(
         self,
         belief: SwarmBelief,
@@ -289,7 +298,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             prior - belief.state[..., : self.process.dim],
             factor.masked_fill(fixed, 0.0),
             noise.masked_fill(fixed, fix_variance),
-            window.fading(self.decay, dt),
+            window.fading(self.decay_rate(noise, fixed, dt), dt),
         )
 
 
