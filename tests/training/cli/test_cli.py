@@ -292,7 +292,7 @@ def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
                 break
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=120)
     finally:
         process.kill()
     assert (process.returncode, errors) == (130, b"interrupted\n")

@@ -67,12 +67,12 @@ def test_workers_end_with_their_parent(kill: signal.Signals, tmp_path: Path) -> 
     command = [sys.executable, str(script), str(out), str(Path(__file__).parent)]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 60)
+        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 300)
         workers = [int(file.name.rsplit("-", 1)[1]) for file in out.glob("*.try-*")]
         assert all(map(_running, workers))
         parent.send_signal(kill)
-        parent.wait(20)
-        _wait_for(lambda: not any(map(_running, workers)), 10)
+        parent.wait(120)
+        _wait_for(lambda: not any(map(_running, workers)), 120)
     finally:
         parent.kill()
         parent.wait()
