@@ -24,9 +24,8 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 from agents.weights import SUFFIX, Learned, card_of, shipped, write
 from coloc_env import options
 from coloc_env.json_files import read_json
-from coloc_env.options import Quantity
+from coloc_env.options import Quantity, typed
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
-from training.evaluation.tables import typed
 from training.learning import curves, state
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
