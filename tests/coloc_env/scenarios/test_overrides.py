@@ -7,7 +7,7 @@ import torch
 
 from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import action_width
-from coloc_env.scenarios import SCENARIOS, make_scenario, parse_override
+from coloc_env.scenarios import SCENARIOS, make_scenario, parse_overrides, parse_scenario
 from coloc_env.world import World
 
 RANGES: dict[str, Any] = {
@@ -221,6 +221,18 @@ def told(family: str, **overrides: Any) -> tuple[Any, ...]:
     return brought, scenario.horizon, scenario.believed, scenario.reference
 
 
+def test_an_override_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_overrides("indoor-v0", ["nlos=0.1", "horizon=9", "nlos=0.1"])
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_scenario("indoor-v0:nlos=0.1:nlos=0.2")
+
+
+def test_a_variants_overrides_go_first() -> None:
+    scenario = parse_scenario("indoor-v0:nlos=0.1:horizon=9", "nlos=0.2")
+    assert scenario.overrides == {"nlos": 0.2, "horizon": 9}
+
+
 @pytest.mark.parametrize("family", CHANGED)
 def test_every_override_is_tried(family: str) -> None:
     assert set(CHANGED[family]) == set(SCENARIOS.options_of(family))
@@ -236,4 +248,4 @@ def test_every_override_changes_something(family: str, name: str) -> None:
 def test_every_override_is_read_from_the_command_line(family: str, name: str) -> None:
     value = CHANGED[family][name]
     text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    assert parse_override(family, f"{name}={text}") == (name, value)
+    assert parse_overrides(family, [f"{name}={text}"]) == {name: value}
