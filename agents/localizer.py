@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -13,6 +13,8 @@ from agents.models.process import drives
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Sensor
+
+_HUGE = 1e30  # m; what lies beyond counts as infinite
 
 
 class Estimate(TensorClass):
@@ -30,6 +32,15 @@ class Estimate(TensorClass):
         variance = self.covariance.diagonal(dim1=-2, dim2=-1)
         log_std = 0.5 * variance.clamp_min(1e-12).log()
         return torch.cat((self.position, self.velocity, log_std), -1).to(torch.float32)
+
+
+def finite_action(
+    estimate: Estimate, before: Float32[Tensor, "B N A"]
+) -> tuple[Float32[Tensor, "B N A"], Bool[Tensor, "B N"]]:
+    """The action, the one before where numbers are not finite, and where they are."""
+    action = estimate.action()
+    finite = (action.abs() < _HUGE).all(-1) & estimate.covariance.isfinite().all(-1).all(-1)
+    return torch.where(finite.unsqueeze(-1), action, before), finite
 
 
 Belief = TypeVar("Belief")

@@ -20,6 +20,8 @@ LOCALIZERS = Registry(
         "apf": "agents.particle.apf:AdaptiveParticleFilter",
         "cspf": "agents.stein.cspf:SteinFilter",
         "dead_reckoning": "agents.kalman.dead_reckoning:DeadReckoning",
+        "dfgo": "agents.factor_graph.dfgo:DistributedFactorGraph",
+        "dfgo_central": "agents.factor_graph.dfgo_central:CentralFactorGraph",
         "dwmds": "agents.swarm.dwmds:CostaMds",
         "dwmds_st": "agents.swarm.dwmds_st:DynamicMds",
         "ekf": "agents.kalman.ekf:CooperativeEkf",

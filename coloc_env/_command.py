@@ -1,7 +1,7 @@
 """The ``coloc`` command's door: checks that ``agents`` and ``training`` are coloc's own.
 
 Both names are common: openai-agents, among others, installs a package ``agents``. Whoever shares an
-environment with such a package is told so in one line, instead of an ImportError from deep inside.
+environment with such a package says so in one line, instead of an ImportError from deep inside.
 """
 
 import importlib

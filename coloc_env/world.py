@@ -292,17 +292,6 @@ class World:
         return self.sensed.alive[:, self.cursor]
 
     @property
-    def links(self) -> Bool[Tensor, "B N N"]:
-        """Whether a message that UAV j sends now would reach UAV i."""
-        heard = self.sensed.leaves["links"][:, self.cursor] > 0
-        senders = self.now.senders
-        if senders is None:
-            return heard
-        n = heard.shape[1]
-        counts = torch.zeros(len(heard), n, n, dtype=torch.int64, device=self.device)
-        return counts.scatter_add_(2, senders.expand(heard.shape), heard.long()) > 0
-
-    @property
     def step_index(self) -> Int64[Tensor, "B"]:
         """The step each row is at: 0 after its reset."""
         return self.sensed.steps[:, self.cursor]
@@ -315,6 +304,14 @@ class World:
     def state(self) -> Float32[Tensor, "B S"]:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""
         return self.sensed.states[:, self.cursor].clone()
+
+    def links(self, row: int) -> Bool[Tensor, "N N"]:
+        """Whether a message that UAV j sends now would reach UAV i, in one world."""
+        heard, senders = self.sensed.leaves["links"][row, self.cursor] > 0, self.now.senders
+        if senders is None:
+            return heard
+        counts = torch.zeros(len(heard), len(heard), dtype=torch.int64, device=self.device)
+        return counts.scatter_add_(1, senders[row], heard.long()) > 0
 
     def messages(self) -> Float32[Tensor, "B N F"]:
         """Delivered messages: senders' actions of 1 + delay steps ago, 0 where there is none."""

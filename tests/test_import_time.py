@@ -32,6 +32,7 @@ def seconds(*commands: Sequence[str]) -> list[float]:
     return [statistics.median(found) for found in times]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ours", "theirs"), [("coloc_env", "torch"), ("agents", "tensordict")])
 def test_an_import_costs_what_it_rests_on(ours: str, theirs: str) -> None:
     own, base = seconds(("-c", f"import {ours}"), ("-c", f"import {theirs}"))

@@ -3,11 +3,10 @@
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float64
-from tensordict import TensorClass
+from jaxtyping import Float64
 from torch import Tensor
 
-from agents.bank.bank import spoken
+from agents.bank.bank import BankBelief, candidate_speaks, spoken
 from agents.bank.branches import stacked
 from agents.bank.evidence import BankOptions, accumulated, predictive_score
 from agents.localizer import Estimate, Localizer
@@ -18,17 +17,7 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation
 
 
-class TeamBankBelief(TensorClass):
-    """Both methods' beliefs, the ``evidence`` for the learned one (nats), and whether this was
-    moved to where the other is in the last step; batch (B, N)."""
-
-    fallback: Any
-    candidate: Any
-    evidence: Float64[Tensor, "B N"]
-    restarted: Bool[Tensor, "B N"]
-
-
-class TeamBank(Localizer[TeamBankBelief]):
+class TeamBank(Localizer[BankBelief]):
     """Two methods side by side. Each UAV speaks with the learned one while the evidence A ≥ 0 that
     this predicts its ranges better; at A < θ it is moved to where the other has it, with A = 0."""
 
@@ -45,10 +34,10 @@ class TeamBank(Localizer[TeamBankBelief]):
     def exchanges(self) -> bool:
         return True
 
-    def reset(self, observation: Observation) -> TeamBankBelief:
+    def reset(self, observation: Observation) -> BankBelief:
         fallback = self.fallback.reset(observation)
         nothing = torch.zeros(fallback.batch_size, dtype=torch.float64, device=observation.device)
-        return TeamBankBelief(
+        return BankBelief(
             fallback=fallback,
             candidate=self.candidate.reset(observation),
             evidence=nothing,
@@ -56,9 +45,7 @@ class TeamBank(Localizer[TeamBankBelief]):
             batch_size=fallback.batch_size,
         )
 
-    def step(
-        self, belief: TeamBankBelief, observation: Observation
-    ) -> tuple[TeamBankBelief, Estimate]:
+    def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
         base, degrees = self.candidate.base, self.options.degrees
         ours = range_score(base.predict(belief.candidate.base, observation), base.std, degrees)
         theirs = range_score(
@@ -70,7 +57,7 @@ class TeamBank(Localizer[TeamBankBelief]):
         restarted = evidence < self.options.restart
         apart = (classical.position - learned.position) * restarted.unsqueeze(-1)
         after = build(
-            TeamBankBelief,
+            BankBelief,
             belief.batch_size,
             fallback=fallback,
             candidate=self.candidate.shifted(candidate, apart),
@@ -79,19 +66,19 @@ class TeamBank(Localizer[TeamBankBelief]):
         )
         return after, spoken(evidence >= 0, stacked(classical, learned))
 
-    def mean(self, belief: TeamBankBelief) -> Float64[Tensor, "B N S"]:
+    def mean(self, belief: BankBelief) -> Float64[Tensor, "B N S"]:
         ours = self.candidate.mean(belief.candidate)
-        speaks = (belief.evidence >= 0) & ~belief.restarted
+        speaks = candidate_speaks(belief)
         return torch.where(speaks.unsqueeze(-1), ours, self.fallback.mean(belief.fallback))
 
-    def shifted(self, belief: TeamBankBelief, offset: Float64[Tensor, "B N d"]) -> TeamBankBelief:
+    def shifted(self, belief: BankBelief, offset: Float64[Tensor, "B N d"]) -> BankBelief:
         return belief.replace(
             fallback=self.fallback.shifted(belief.fallback, offset),
             candidate=self.candidate.shifted(belief.candidate, offset),
         )
 
-    def diagnostics(self, belief: TeamBankBelief) -> dict[str, Tensor]:
-        speaks = (belief.evidence >= 0) & ~belief.restarted
+    def diagnostics(self, belief: BankBelief) -> dict[str, Tensor]:
+        speaks = candidate_speaks(belief)
         return self.candidate.diagnostics(belief.candidate) | {
             "learned_share": speaks.float(),
             "map_share": (~speaks).float(),

@@ -3,35 +3,35 @@
 Roumeliotis & Bekey 2002 with the error state on the manifold: (δp, δv, δθ) and, where the team
 believes in them, IMU biases. Ranges to neighbours use their broadcast estimate *and* its
 uncertainty. What the UAVs' estimates have in common is ignored by that (``fusion="naive"``), so the
-filter can grow overconfident; ``fusion="ci"`` never does, at a price.
+filter can grow overconfident; the other methods of fusion are not, at a price.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.kalman.filter import GaussianFilter
-from agents.models.measurements import (
-    Block,
-    Measurement,
-    Neighbours,
-    make_measurements,
-    received,
-)
-from agents.models.measurements.second_order import expanded
+from agents.kalman.exchange import ExchangingEkf
+from agents.kalman.expanded import expanded_update
+from agents.kalman.filter import Beside, GaussianBelief, GaussianFilter
+from agents.kalman.fusion import Fusion
+from agents.kalman.intersection import Intersection
+from agents.kalman.late import LateFusion
+from agents.kalman.pairwise import Pairwise
+from agents.localizer import Localizer
+from agents.models.biases import kept_share, reported
+from agents.models.measurements import make_measurements, received
 from agents.models.ordered_update import by_kind, pick
-from agents.models.update import information, iterated_update, posterior
+from agents.models.update import iterated_update
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 
-# Weights tried by covariance intersection.
-_OMEGA = (1.0, 0.99, 0.97, 0.93, 0.87, 0.8, 0.7, 0.55, 0.4)
+_OTHERS = {"fusion", "second_order"}  # options that the exchange of measurements has not
+FusionName = Literal["naive", "ci", "pairwise", "exchange"]
 
 
 class CooperativeEkf(GaussianFilter):
@@ -40,10 +40,15 @@ class CooperativeEkf(GaussianFilter):
     ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration;
     ``gate`` drops innovations outside the χ² quantile ``gate``, ``ransac`` landmarks that do not
     agree with most others, ``temporal`` what does not agree with the last two steps, ``cross`` what
-    neighbours' measurements contradict. ``fusion``: ``naive``, or ``ci`` (split covariance
-    intersection for everything that involves a neighbour). ``iterations`` of each update.
-    ``cooperate=false`` leaves other UAVs out. ``second_order``, with ``fusion=ci``: ranges are
-    expanded to the second order, as ``ekf_joint`` has them, where priors are broad too.
+    neighbours' measurements contradict. ``iterations`` of each update. ``cooperate=false`` leaves
+    other UAVs out.
+
+    ``fusion`` of what involves neighbours: ``naive``, as if their errors were independent; ``ci``,
+    covariance intersection, one neighbour after the other; ``pairwise``, UAVs that meet (at most
+    ``partners`` a step) update jointly and keep what they then share; ``exchange``, all raw
+    measurements reach everybody, who runs ``ekf_joint`` on them. ``second_order``, with
+    ``fusion=ci``: all neighbours at once, by their messages alone, and ranges expanded to the
+    second order, as ``ekf_joint`` has them, where priors are broad too.
     """
 
     name = "ekf"
@@ -54,136 +59,121 @@ class CooperativeEkf(GaussianFilter):
         *,
         robust: str = "none",
         gate: OpenShare = 0.999,
-        fusion: Literal["naive", "ci"] = "naive",
+        fusion: FusionName = "naive",
+        partners: PositiveCount = 1,
         iterations: PositiveCount = 2,
         cooperate: bool = True,
         second_order: bool = False,
     ) -> None:
         super().__init__(believed)
-        if second_order and fusion != "ci":
-            raise ValueError(f"ekf: second_order=true is not allowed with fusion={fusion}: ci")
-        self.iterations, self.fusion = iterations, fusion
-        self.second_order = second_order
+        self.iterations, self.second_order = iterations, second_order
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        own, shared = by_kind(self.models)
+        self.kinds = own, shared
+        self.fusion: Fusion | None = None
+        if fusion == "ci" and shared and not second_order:
+            self.fusion = Intersection(believed, self.process, pick(self.models, shared))
+        elif fusion == "pairwise" and shared:
+            models = pick(self.models, shared)
+            self.fusion = Pairwise(believed, self.process, models, partners)
+        elif fusion == "exchange":
+            raise ValueError("fusion='exchange' is not allowed: one of naive, ci, pairwise")
+
+    @classmethod
+    def for_team(cls, believed: Believed, **options: Any) -> Localizer[Any]:
+        """The filter; with ``fusion=exchange``, or a fusion of late messages, what works so.
+
+        Raises ValueError for options that the fusion does not have."""
+        cls.require_sense(options)
+        fusion = options.get("fusion", "naive")
+        if fusion == "exchange":
+            chosen = {name: options[name] for name in options.keys() - _OTHERS}
+            return ExchangingEkf(believed, **chosen)
+        one = cls(believed, **options)
+        if fusion == "pairwise" and believed.message_delay:
+            return LateFusion(believed, one)
+        return one
+
+    @staticmethod
+    def require_sense(options: Mapping[str, Any]) -> None:
+        """Raise ValueError for options that the fusion does not have."""
+        fusion = options.get("fusion", "naive")
+        if fusion != "ci" and options.get("second_order"):
+            raise ValueError(f"second_order=true is not allowed with fusion={fusion}: only with ci")
+        if fusion != "pairwise" and "partners" in options:
+            raise ValueError(f"partners is not allowed with fusion={fusion}: only with pairwise")
 
     @property
     def exchanges(self) -> bool:
-        return self.screen.exchanges
+        return self.screen.exchanges or self.fusion is not None
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         return self.screen.memory(observation)
 
-    def update(
-        self, prior: Prediction
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
-        if not self.models:
-            return super().update(prior)
-        neighbours = received(self.believed, prior.observation)
-        if self.second_order:
-            return self._expanded(prior, neighbours)
-        found = iterated_update(prior, neighbours, self.screen, self.iterations)
-        if self.fusion == "naive":
-            return found.state, found.covariance, found.memory
-        x, covariance = self._split(prior, neighbours, found.trusts)
-        return x, covariance, found.memory
+    def shared(self, observation: Observation) -> Float[Tensor, "B N H"]:
+        if self.fusion is None:
+            return super().shared(observation)
+        return self.fusion.initial(observation)
 
-    def _split(
-        self, prior: Prediction, neighbours: Neighbours, trusts: Sequence[Trust]
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-        """First the UAV's own measurements, then an intersection with what involves neighbours;
-        each trusted as in the naive update."""
-        pairs = list(zip(self.models, trusts, strict=True))
-        own = [pair for pair in pairs if not pair[0].cooperative]
-        shared = [pair for pair in pairs if pair[0].cooperative]
-        x, covariance = prior.state, prior.covariance
+    def moved(
+        self, shared: Float[Tensor, "B N H"], f: Float[Tensor, "B N E E"]
+    ) -> Float[Tensor, "B N H"]:
+        return shared if self.fusion is None else self.fusion.scaled(shared, f)
+
+    def diagnostics(self, belief: GaussianBelief) -> dict[str, Float[Tensor, "B N"]]:
+        """``bytes`` that each UAV sent in the step, float32 numbers."""
+        if self.screen.exchanges or not self.kinds[1]:
+            return {}
+        if self.fusion is not None:
+            return {"bytes": self.fusion.sent(belief.shared)}
+        return {"bytes": belief.state.new_full(belief.step.shape, 4 * 3 * self.process.dim)}
+
+    def update(
+        self, prior: Prediction, beside: Beside
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside]:
+        if not self.models:
+            return super().update(prior, beside)
+        if self.fusion is not None:
+            return self._fused(prior, beside, self.fusion)
+        neighbours, seen = received(self.believed, prior.observation), prior.observation
+        if self.second_order:
+            found = expanded_update(prior, neighbours, self.screen)
+        else:
+            found = iterated_update(prior, neighbours, self.screen, self.iterations)
+        considered = self.biases.of_update(
+            beside.considered, prior.covariance, found.covariance, found.blocks, found.trusts, seen
+        )
+        return found.state, found.covariance, found.memory, replace(beside, considered=considered)
+
+    def _fused(
+        self, prior: Prediction, beside: Beside, fusion: Fusion
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside]:
+        """First the UAV's own measurements, then what involves others; each trusted as in the naive
+        update."""
+        seen, memory = prior.observation, prior.memory
+        trusts = [Trust()] * len(self.models)
+        neighbours = fusion.neighbours(prior)
+        if self.screen.judges:
+            naive = iterated_update(prior, neighbours, self.screen, self.iterations)
+            trusts, memory = naive.trusts, naive.memory
+        own, shared = self.kinds
+        x, p, considered, others = prior.state, prior.covariance, beside.considered, beside.shared
         if own:
-            models, fixed = zip(*own, strict=True)
+            models, fixed = pick(self.models, own), pick(trusts, own)
             screen = Fixed(self.process, models, fixed)
             found = iterated_update(prior, neighbours, screen, self.iterations)
-            x, covariance = found.state, found.covariance
-        if shared:
-            models, fixed = zip(*shared, strict=True)
-            blocks = [m.linearize(self.process, x, prior.observation, neighbours) for m in models]
-            x, covariance = self._intersect(x, covariance, blocks, fixed)
-        return x, covariance
-
-    def _expanded(
-        self, prior: Prediction, neighbours: Neighbours
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
-        """As ``_split``, with ranges' second-order terms, in one iteration."""
-        x, covariance = prior.state, prior.covariance
-        blocks = self._blocks(x, covariance, prior, neighbours, self.models)
-        evidence = self.screen.judge(blocks, prior)
-        trusts = self.screen.weigh(blocks, evidence, True)
-        own, shared = by_kind(self.models)
-        if own:
-            known = information(pick(blocks, own), pick(trusts, own))
-            delta, covariance = posterior(covariance, *known)
-            x = self.process.boxplus(x, delta)
-        if shared:
-            models = pick(self.models, shared)
-            blocks = self._blocks(x, covariance, prior, neighbours, models)
-            x, covariance = self._intersect(x, covariance, blocks, pick(trusts, shared))
-        memory = self.screen.remember(
-            prior, evidence, lambda: self._blocks(x, covariance, prior, neighbours, self.models)
-        )
-        return x, covariance, memory
-
-    def _blocks(
-        self,
-        x: Float[Tensor, "B N S"],
-        covariance: Float[Tensor, "B N E E"],
-        prior: Prediction,
-        neighbours: Neighbours,
-        models: Sequence[Measurement],
-    ) -> list[Block]:
-        """Measurements linearized at a state, ranges expanded to the second order."""
-        d, observation = self.process.dim, prior.observation
-        own = covariance[..., None, :d, :d]
-        apart = own + torch.diag_embed(neighbours.variance)
-        return [
-            expanded(
-                model,
-                model.linearize(self.process, x, observation, neighbours),
-                apart if model.cooperative else own,
-                observation,
+            others = fusion.scaled(others, kept_share(p, found.covariance))
+            considered = self.biases.of_update(
+                considered, p, found.covariance, found.blocks, fixed, seen, models
             )
-            for model in models
-        ]
-
-    def _intersect(
-        self,
-        x: Float[Tensor, "B N S"],
-        covariance: Float[Tensor, "B N E E"],
-        blocks: Sequence[Block],
-        trusts: Sequence[Trust],
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-        """Split covariance intersection (Julier & Uhlmann 2001; Li & Nashashibi 2013): own
-        covariance over ω, the neighbours' over 1 − ω, ω chosen for the least position variance."""
-        d = self.process.dim
-        best: tuple[Tensor, Tensor, Tensor] | None = None
-        for omega in _OMEGA:
-            if omega == 1.0:
-                delta, updated = torch.zeros_like(covariance[..., 0]), covariance
-            else:
-                apart = [_inflated(block, 1 - omega) for block in blocks]
-                delta, updated = posterior(covariance / omega, *information(apart, trusts))
-            trace = updated[..., :d, :d].diagonal(dim1=-2, dim2=-1).sum(-1)
-            if best is None:
-                best = (trace, delta, updated)
-            else:
-                better = trace < best[0]
-                best = (
-                    torch.where(better, trace, best[0]),
-                    torch.where(better[..., None], delta, best[1]),
-                    torch.where(better[..., None, None], updated, best[2]),
-                )
-        assert best is not None
-        return self.process.boxplus(x, best[1]), best[2]
-
-
-def _inflated(block: Block, share: float) -> Block:
-    """The block with its partners' uncertainty divided by their share of the weight."""
-    assert block.partner_variance is not None
-    return replace(block, partner_variance=block.partner_variance / share)
+            x, p = found.state, found.covariance
+        after_own = replace(prior, state=x, covariance=p)
+        taken, others = fusion.fuse(after_own, replace(beside, shared=others), pick(trusts, shared))
+        for one in taken:
+            x, p = one.state, one.covariance
+            if self.biases:
+                gain = self.biases.by_bias(one.gains, seen)
+                considered = self.biases.update(considered, one.kept, gain, seen)
+        others = fusion.remember(others, reported(p, considered))
+        return x, p, memory, replace(beside, considered=considered, shared=others)

@@ -1,11 +1,16 @@
 """What Kalman filters have in common: a Gaussian belief on the manifold, and its prediction."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
+from agents.models.measurements import Measurement
 from agents.models.process import Process, make_process
 from agents.robust import Prediction
 from agents.tensorclasses import build
@@ -14,11 +19,14 @@ from coloc_env.scenario import Believed
 
 
 class GaussianBelief(TensorClass):
-    """Mean state, error covariance (float64), steps taken, and what a screen remembers of earlier
-    measurements; batch (B, N)."""
+    """Mean state, error covariance (float64), what sensors' biases have made of the error (see
+    ``agents.models.biases``), what a fusion method keeps of other UAVs, steps taken, and what a
+    screen remembers of earlier measurements; batch (B, N)."""
 
     state: Float[Tensor, "B N S"]
     covariance: Float[Tensor, "B N E F"]
+    considered: Float[Tensor, "B N E G"]
+    shared: Float[Tensor, "B N H"]
     step: Int64[Tensor, "B N"]
     memory: Float[Tensor, "B N K"]
 
@@ -35,15 +43,25 @@ def elapsed(process: Process, step: Int64[Tensor, "B N"]) -> Float[Tensor, "B N"
     return (step > 0).to(torch.float32) * process.dt
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What a belief holds beside mean and covariance; fields as ``GaussianBelief`` has them."""
+
+    considered: Float[Tensor, "B N E G"]
+    shared: Float[Tensor, "B N H"]
+    step: Int64[Tensor, "B N"]
+
+
 def predict(
     process: Process, belief: GaussianBelief, observation: Observation
-) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"]]:
-    """Mean and covariance at the observation's step, before its measurements are used."""
+) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N E E"]]:
+    """Mean and covariance at the observation's step, before its measurements are used, and the
+    transition F that led there."""
     dt = elapsed(process, belief.step).double()
     u = process.inputs(observation)
     f, q = process.linearize(belief.state, u, dt)
     x = process.propagate(belief.state, u, dt)  # x⁻ = f(x, u)
-    return x, f @ belief.covariance @ f.mT + q  # P⁻ = F P Fᵀ + Q
+    return x, f @ belief.covariance @ f.mT + q, f  # P⁻ = F P Fᵀ + Q
 
 
 def gaussian_estimate(
@@ -61,17 +79,29 @@ def gaussian_estimate(
 
 
 class GaussianFilter(Localizer[GaussianBelief]):
-    """A Kalman filter for each UAV: prediction by the motion model, then ``update``."""
+    """A Kalman filter for each UAV: prediction by the motion model, then ``update``.
+
+    Where the team believes that what ``models`` measure is biased, its estimates' covariances
+    consider that, and gains are what they are without.
+    """
+
+    models: Sequence[Measurement] = ()
 
     def __init__(self, believed: Believed) -> None:
         super().__init__(believed)
         self.process = make_process(believed)
+
+    @property
+    def biases(self) -> Biases:
+        return Biases(self.models, self.process.dt)
 
     def reset(self, observation: Observation) -> GaussianBelief:
         x, covariance = self.process.initial(observation["prior"].double())
         return GaussianBelief(
             state=x,
             covariance=covariance,
+            considered=self.biases.initial(observation, covariance),
+            shared=self.shared(observation),
             step=torch.zeros(x.shape[:2], dtype=torch.int64, device=x.device),
             memory=self.memory(observation),
             batch_size=x.shape[:2],
@@ -80,18 +110,23 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
-        x, covariance = predict(self.process, belief, observation)
+        x, covariance, f = predict(self.process, belief, observation)
         prior = Prediction(x, covariance, observation, belief.memory)
-        x, covariance, memory = self.update(prior)
+        considered = self.biases.predict(belief.considered, f, observation)
+        beside = Beside(considered, self.moved(belief.shared, f), belief.step)
+        x, covariance, memory, beside = self.update(prior, beside)
         after = build(
             GaussianBelief,
             x.shape[:2],
             state=x,
             covariance=covariance,
+            considered=beside.considered,
+            shared=beside.shared,
             step=belief.step + 1,
             memory=memory,
         )
-        return after, gaussian_estimate(self.process, x, covariance)
+        honest = reported(covariance, beside.considered)
+        return after, gaussian_estimate(self.process, x, honest)
 
     def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
         return belief.state
@@ -111,17 +146,30 @@ class GaussianFilter(Localizer[GaussianBelief]):
         state: Float[Tensor, "B N S"],
         covariance: Float[Tensor, "B N E E"],
     ) -> GaussianBelief:
+        row = rows.unsqueeze(-1)
         return belief.replace(
-            state=torch.where(rows.unsqueeze(-1), state, belief.state),
-            covariance=torch.where(rows[..., None, None], covariance, belief.covariance),
+            state=torch.where(row, state, belief.state),
+            covariance=torch.where(row.unsqueeze(-1), covariance, belief.covariance),
+            considered=torch.where(row.unsqueeze(-1), 0.0, belief.considered),
+            shared=torch.where(row, 0.0, belief.shared),
         )
+
+    def shared(self, observation: Observation) -> Float[Tensor, "B N H"]:
+        """What is kept of other UAVs before the first step: nothing."""
+        return observation["prior"][..., :0].double()
+
+    def moved(
+        self, shared: Float[Tensor, "B N H"], f: Float[Tensor, "B N E E"]
+    ) -> Float[Tensor, "B N H"]:
+        """The same after a step of transition F."""
+        return shared
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
         """What is remembered of measurements before the first: nothing."""
         return observation["prior"][..., :0]
 
     def update(
-        self, prior: Prediction
-    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"]]:
+        self, prior: Prediction, beside: Beside
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside]:
         """Use the observation's measurements: none here."""
-        return prior.state, prior.covariance, prior.memory
+        return prior.state, prior.covariance, prior.memory, beside

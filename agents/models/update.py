@@ -14,10 +14,12 @@ from agents.robust.screen import Prediction, Screen, Trust
 
 @dataclass(frozen=True)
 class Update:
-    """A posterior, the trust that its measurements got, and what the screen remembers."""
+    """A posterior, the blocks of its last iteration with the trust that these got, and what the
+    screen remembers."""
 
     state: Float[Tensor, "B N S"]
     covariance: Float[Tensor, "B N E E"]
+    blocks: list[Block]
     trusts: list[Trust]
     memory: Float[Tensor, "B N K"]
 
@@ -59,7 +61,7 @@ def iterated_update(
     """
     process, x, covariance = screen.process, prior.state, prior.covariance
     state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
-    evidence, trusts = None, []
+    evidence, blocks, trusts = None, [], []
     broad = prior.broad(process.dim).unsqueeze(-1)
     extra = screen.extra if bool(broad.any()) else 0
 
@@ -94,4 +96,4 @@ def iterated_update(
         state = torch.where(vague, found[0], state)
         updated = torch.where(vague.unsqueeze(-1), found[1], updated)
     memory = screen.remember(prior, evidence, lambda: linearize(state, screen.models))
-    return Update(state, updated, trusts, memory)
+    return Update(state, updated, blocks, trusts, memory)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -17,9 +17,10 @@ from coloc_env.observation import Observation
 
 class ParticleBelief(TensorClass):
     """Particles (float32) with normalized log-weights (−∞ for slots beyond ``count``), the UAV's
-    own random key, steps taken, the last effective sample size as a share of its count, position
-    and velocity of the last estimate (of the prior before), and what the screen remembers; batch
-    (B, N)."""
+    own random key, steps taken, the last effective sample size as a share of its count, whether the
+    last step redrew it from an EKF's posterior, position and velocity of the last estimate (of the
+    prior before), what sensors' biases have made of the error (see ``agents.models.biases``), and
+    what the screen remembers; batch (B, N)."""
 
     particles: Float32[Tensor, "B N M S"]
     log_weights: Float32[Tensor, "B N M"]
@@ -27,7 +28,9 @@ class ParticleBelief(TensorClass):
     key: Int64[Tensor, "B N"]
     step: Int64[Tensor, "B N"]
     ess_share: Float32[Tensor, "B N"]
+    renewed: Bool[Tensor, "B N"]
     last: Float32[Tensor, "B N 2*d"]
+    considered: Float[Tensor, "B N E G"]
     memory: Float[Tensor, "B N K"]
 
     def shifted(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":

@@ -30,12 +30,14 @@ def degenerate(
 
 @dataclass(frozen=True)
 class Rejuvenation:
-    """What is done for UAVs whose weights degenerate in a step."""
+    """What is done for UAVs whose weights degenerate in a step; ``renews``: whether they may be
+    redrawn from an EKF's posterior."""
 
     evidence: Evidence
     screen: Screen
     resampling: Resampling
     now: Step
+    renews: bool
 
     def rejuvenate(
         self,
@@ -44,11 +46,13 @@ class Rejuvenation:
         gain: Float32[Tensor, "B N M"],
         few: Bool[Tensor, "B N"],
         density: ImportanceDensity | None,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
         """Particles and unnormalized log-weights where evidence (``gain``) would leave ``few``: in
         the first steps used in stages with a resampling move after each; later, or where a screen
-        has made a density already, on redrawn particles. Other UAVs keep theirs."""
+        has made a density already, on redrawn particles (where that is wanted), which is marked.
+        Other UAVs keep theirs."""
         late = few if self.screen.judges else few & (self.now.belief.step >= _START)
+        late = late & self.renews
         early = few & ~late
         if bool(late.any()):
             floor = self.resampling.floor
@@ -58,8 +62,9 @@ class Rejuvenation:
             particles, log_weights, gain = self.redraw(particles, log_weights, gain, late, density)
         if bool(early.any()):
             evidence, resampling, now = self.evidence, self.resampling, self.now
-            return tempered(particles, log_weights, gain, early, evidence, resampling, now)
-        return particles, log_weights + gain
+            used = tempered(particles, log_weights, gain, early, evidence, resampling, now)
+            return *used, late
+        return particles, log_weights + gain, late
 
     def redraw(
         self,

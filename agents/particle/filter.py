@@ -1,9 +1,8 @@
 """SIR particle filters with Liu-West regularization and adaptive tempering, one per UAV.
 
 Gordon, Salmond & Smith 1993; resampling when the effective sample size falls below half.
-Neighbours' messages enter as ranges whose variance is inflated by the sender's own uncertainty.
-Particles live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper,
-Algorithms 1 and 2).
+Neighbours enter as ranges whose variance is inflated by the sender's own uncertainty. Particles
+live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper, Algorithms 1, 2).
 """
 
 from dataclasses import replace
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements, no_neighbours, received
 from agents.models.process import make_process
 from agents.particle import particle_count, sampling
@@ -23,28 +23,37 @@ from agents.particle.belief import ParticleBelief, Step, normal, own_keys
 from agents.particle.cloud import Moments, moments, select
 from agents.particle.degeneracy import Rejuvenation, degenerate
 from agents.particle.likelihood import log_likelihood
-from agents.particle.proposal import draw, importance_density
+from agents.particle.printed import PERTURB_STD, PrintedResampling, anywhere
+from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.robust import RobustScreen, Screen, Trust
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
-from coloc_env.options import Count, OpenShare, Quantity
+from coloc_env.options import Count, OpenShare, PositiveMetres, Quantity
 from coloc_env.scenario import Believed
 
 Proposal = Literal["prior", "ekf"]
+Renewal = Literal["ekf", "none"]
+Variant = Literal["regularized", "paper"]
 Particles = Annotated[int, Quantity("", 10, 100_000)]
+_USUAL = ("liu_west", "ekf", "prior", "none")  # perturb, renewal, proposal, robust
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
     """Bootstrap filter; its number of particles is fixed unless ``bounds`` let it adapt.
 
     ``perturb``: ``liu_west`` moves resampled particles so that the cloud keeps its moments, above a
-    small floor; ``fixed`` adds N(0, Σ_perturb) instead (the paper's way). A likelihood that leaves
-    few particles is used in stages in the first steps; later, particles are redrawn from 1.1 ×
+    small floor; ``fixed`` adds N(0, Σ_perturb) instead. A likelihood that leaves few particles is
+    used in stages in the first steps; later (``renewal=ekf``), particles are redrawn from 1.1 ×
     an EKF's posterior about the cloud's moments, with exact weights (Kotecha & Djurić 2003) if
-    enough survive those; ``proposal=ekf`` does so at every step.
-    ``tempering=false`` uses every likelihood as it comes.
+    enough survive those; ``renewal=none`` uses stages then, too; ``proposal=ekf`` redraws at every
+    step. ``tempering=false`` uses every likelihood as it comes.
+    ``variant=paper`` is the PF-NN paper's filter as printed instead of this ``regularized`` one:
+    particles uniform in the arena at the start, plain weights (a neighbour counts as if its
+    estimate were exact), resampling and counts as its Algorithms 1 and 2 have them,
+    N(0, ``perturb_std``²) m added to positions, a tenth of it to velocities (m/s) and attitudes
+    (rad), no tempering and no redraw.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
     ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.
@@ -61,25 +70,35 @@ class ParticleFilter(Localizer[ParticleBelief]):
         seed: Count = 0,
         perturb: Perturb = "liu_west",
         tempering: bool = True,
+        renewal: Renewal = "ekf",
         proposal: Proposal = "prior",
         robust: str = "none",
         gate: OpenShare = 0.999,
         cooperate: bool = True,
         compile: bool = False,
+        variant: Variant = "regularized",
+        perturb_std: PositiveMetres = PERTURB_STD,
     ) -> None:
         super().__init__(believed)
+        self.printed = variant == "paper"
+        if self.printed and (perturb, renewal, proposal, robust) != _USUAL:
+            raise ValueError("variant=paper takes no perturb, renewal, proposal or robust")
+        if not self.printed and perturb_std != PERTURB_STD:
+            raise ValueError("perturb_std is allowed with variant=paper only")
         if bounds is not None and not bounds[0] <= particles <= bounds[1]:
             raise ValueError(
                 f"bounds={bounds} is not allowed: low,high with low ≤ particles ({particles}) "
                 "≤ high"
             )
-        self.particles, self.seed, self.tempering = particles, seed, tempering
+        self.particles, self.seed = particles, seed
+        self.tempering, self.renewal = tempering and not self.printed, renewal
         self.bounds, self.proposal = bounds, proposal
         self.capacity = particles if bounds is None else bounds[1]
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
-        self.resampling = Resampling(self.process, perturb, bounds)
+        made = PrintedResampling(self.process, perturb_std, bounds) if self.printed else None
+        self.resampling = made or Resampling(self.process, perturb, bounds)
         self.compiled = compile
         if compile:
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
@@ -96,9 +115,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
         m = self.capacity
-        particles = sampling.from_prior(self.process, self.believed, mean, covariance, key, m)
+        believed = anywhere(self.believed) if self.printed else self.believed
+        particles = sampling.from_prior(self.process, believed, mean, covariance, key, m)
         count = torch.full_like(key, self.particles)
         live = particle_count.alive(count, m)
+        if self.printed:
+            mean = moments(self.process, particles, live / count.unsqueeze(-1)).mean
         return ParticleBelief(
             particles=torch.where(live.unsqueeze(-1), particles, mean.unsqueeze(-2)),
             log_weights=particle_count.equal_log_weights(live),
@@ -106,7 +128,9 @@ class ParticleFilter(Localizer[ParticleBelief]):
             key=key,
             step=torch.zeros_like(key),
             ess_share=torch.ones_like(prior[..., 0]),
+            renewed=torch.zeros_like(key, dtype=torch.bool),
             last=mean[..., : 2 * self.process.dim],
+            considered=self.biases.initial(observation, covariance.double()),
             memory=self.screen.memory(observation),
             batch_size=key.shape,
         )
@@ -120,13 +144,16 @@ class ParticleFilter(Localizer[ParticleBelief]):
         )
         if any(model.cooperative for model in self.models):
             neighbours = received(self.believed, observation)
+            if self.printed:
+                neighbours = replace(neighbours, variance=torch.zeros_like(neighbours.variance))
         now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
-        particles, log_weights, memory = self._updated(now)
+        particles, log_weights, renewed, density = self._updated(now)
         weighed = self.resampling.weigh(particles, log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
             particles, weighed, belief.count, key
         )
-        mean = weighed.cloud.mean
+        cloud = self.resampling.estimated(weighed, particles, log_weights)
+        mean = cloud.mean
         after = build(
             ParticleBelief,
             key.shape,
@@ -136,10 +163,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
             key=belief.key,
             step=belief.step + 1,
             ess_share=weighed.ess / belief.count,
+            renewed=renewed,
             last=mean[..., : 2 * self.process.dim],
-            memory=memory,
+            considered=self._considered(now, density),
+            memory=belief.memory if density is None else density.posterior.memory,
         )
-        return after, self._estimate(weighed.cloud)
+        return after, self._estimate(cloud, after.considered)
 
     def mean(self, belief: ParticleBelief) -> Float32[Tensor, "B N S"]:
         return moments(self.process, belief.particles, belief.log_weights.exp()).mean
@@ -169,10 +198,19 @@ class ParticleFilter(Localizer[ParticleBelief]):
             ),
             count=count,
             last=torch.where(row, state[..., : 2 * self.process.dim], belief.last),
+            considered=torch.where(row.unsqueeze(-1), 0.0, belief.considered),
         )
 
     def diagnostics(self, belief: ParticleBelief) -> dict[str, Float[Tensor, "B N"]]:
-        return {"particles": belief.count.to(torch.float32), "ess_share": belief.ess_share}
+        own = {
+            "particles": belief.count.to(torch.float32),
+            "ess_share": belief.ess_share,
+            "renewed": belief.renewed.to(torch.float32),
+        }
+        if any(model.cooperative for model in self.models) and not self.screen.exchanges:
+            message = 4.0 * 3 * self.process.dim
+            own["bytes"] = torch.full_like(belief.ess_share, message)
+        return own
 
     def log_correction(
         self, particles: Float32[Tensor, "B N M S"], belief: ParticleBelief
@@ -189,34 +227,41 @@ class ParticleFilter(Localizer[ParticleBelief]):
 
     def _updated(
         self, now: Step
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Float[Tensor, "B N K"]]:
+    ) -> tuple[
+        Float32[Tensor, "B N M S"],
+        Float32[Tensor, "B N M"],
+        Bool[Tensor, "B N"],
+        ImportanceDensity | None,
+    ]:
         """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
-        normalized), and what the screen remembers."""
+        normalized), which were redrawn from an EKF's posterior, and the Gaussian update beside it,
+        where anything asks for one."""
         belief = now.belief
         slots = self._slots(belief.count)
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
         draws = normal(now.key, "pf.step", self.process.noise_size, slots)
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
-        density, memory = None, belief.memory
-        if self.models and (self.screen.judges or self.proposal == "ekf"):
+        density, renewed = None, torch.zeros_like(belief.renewed)
+        if self.models and (self.screen.judges or self.proposal == "ekf" or self.biases):
             particles = self.process.propagate(particles, u, dt, draws)
             density = importance_density(
                 self.screen, self.resampling.floor, particles, log_weights, now
             )
-            now, memory = replace(now, trusts=density.posterior.trusts), density.posterior.memory
+            now = replace(now, trusts=density.posterior.trusts)
             if self.proposal == "ekf":
                 particles, log_weights = draw(self.process, density, now, slots)
+                renewed = ~renewed
             gain = self._evidence(particles, log_weights, now)
             few = self._degenerate(log_weights + gain, now)
         else:
             particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
         if not (self.models and bool(few.any())):
-            return particles, log_weights + gain, memory
-        rejuvenation = Rejuvenation(
-            partial(self._evidence, now=now), self.screen, self.resampling, now
-        )
-        return *rejuvenation.rejuvenate(particles, log_weights, gain, few, density), memory
+            return particles, log_weights + gain, renewed, density
+        evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
+        rejuvenation = Rejuvenation(evidence, self.screen, self.resampling, now, renews)
+        found = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
+        return found[0], found[1], renewed | found[2], density
 
     def _foresee(
         self,
@@ -252,9 +297,32 @@ class ParticleFilter(Localizer[ParticleBelief]):
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
 
-    def _estimate(self, cloud: Moments) -> Estimate:
+    @property
+    def biases(self) -> Biases:
+        return Biases(self.models, self.process.dt)
+
+    def _considered(self, now: Step, density: ImportanceDensity | None) -> Float[Tensor, "B N E G"]:
+        """What biases make of the error in this step, with the gains of the Gaussian update."""
+        belief, seen = now.belief, now.observation
+        if density is None or not self.biases:
+            return belief.considered
+        dt = elapsed(self.process, belief.step).double()
+        before = self.mean(belief).double()
+        f, _ = self.process.linearize(before, self.process.inputs(seen), dt)
+        considered = self.biases.predict(belief.considered, f, seen)
+        found = density.posterior
+        return self.biases.of_update(
+            considered,
+            density.prior.covariance,
+            found.covariance,
+            found.blocks,
+            found.trusts,
+            seen,
+        )
+
+    def _estimate(self, cloud: Moments, considered: Float[Tensor, "B N E G"]) -> Estimate:
         """The weighted cloud's mean, never surer of the position than the floor."""
-        d, covariance = self.process.dim, cloud.covariance
+        d, covariance = self.process.dim, reported(cloud.covariance, considered)
         least = torch.eye(d, dtype=torch.float64, device=covariance.device) * FLOOR["position"] ** 2
         return build(
             Estimate,

@@ -40,7 +40,7 @@ class Resampling:
     def __init__(self, process: Process, perturb: Perturb, bounds: tuple[int, int] | None) -> None:
         self.process, self.bounds = process, bounds
         self.shrinkage, std = (0.7, FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
-        self.floor = torch.tensor(_per_error(process, std), dtype=torch.float64)
+        self.floor = torch.tensor(per_error(process, std), dtype=torch.float64)
 
     def weigh(
         self,
@@ -90,6 +90,15 @@ class Resampling:
         equal = particle_count.equal_log_weights(live)
         log_weights = torch.where(few.unsqueeze(-1), equal, weighed.log_weights)
         return particles, log_weights
+
+    def estimated(
+        self,
+        weighed: Weighed,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+    ) -> Moments:
+        """The cloud that the step's estimate is made of: the weighted one, before resampling."""
+        return weighed.cloud
 
     @staticmethod
     def few(weighed: Weighed, count: Int64[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
@@ -156,7 +165,7 @@ def padded(
     return torch.cat((particles.movedim(-1, 0), rest.movedim(-1, 0)), -1).movedim(0, -1)
 
 
-def _per_error(process: Process, std: dict[str, float]) -> list[float]:
+def per_error(process: Process, std: dict[str, float]) -> list[float]:
     """A standard deviation for each component of the process's error."""
     d, turn = process.dim, process.attitude_error
     if turn is None:

@@ -1,13 +1,17 @@
 """Decisions of a learned policy in a task: what it reads, and what its choices stand for."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from agents.policies import candidates
 from agents.policies.moves import table
+from agents.policies.task_actor import TaskActor
 from agents.tasks.memory import TaskMemory
 from agents.tasks.task import Task
+from agents.weights import untrained
 
 
 def relations(task: Task, memory: TaskMemory, network: str) -> Float32[Tensor, "B n r K"] | None:
@@ -45,3 +49,32 @@ def outputs_of(task: Task, moves: str) -> tuple[int, bool]:
     if moves != "none":
         return len(table(moves, task.dim)), True
     return task.width, False
+
+
+def actor_for(
+    name: str,
+    task: Task,
+    seed: int,
+    *,
+    network: str = "feedforward",
+    moves: str = "none",
+    hold: int = 1,
+    **options: Any,
+) -> TaskActor:
+    """An untrained network for a task, whose ``name`` carries its options; ``options`` as
+    ``TaskActor`` has them. Raises ValueError as ``require_decisions`` does."""
+    require_decisions(task, network, moves, hold)
+    outputs, discrete = outputs_of(task, moves)
+    return untrained(
+        TaskActor,
+        seed,
+        task=name,
+        observation=task.leaves["observation"].width,
+        outputs=outputs,
+        discrete=discrete,
+        network=network,
+        moves=moves,
+        hold=hold,
+        features=relations_width(task, network),
+        **options,
+    )

@@ -61,7 +61,7 @@ class TaskActor(Learned):
     graph attention over neighbours between the layers; ``candidates``, every choice scored by one
     network from what its exchange would do. ``outputs``: choices, or numbers of an action where
     ``discrete`` is not set. ``task``: with its options; ``moves`` and ``hold``: the menu that
-    choices stand for, and for how many steps each is held. ``sampled``: choices are drawn, not the
+    choices stand for, and for how many steps each is held. ``sampled``: actions are drawn, not the
     likeliest taken, as those on a channel that equals share must be. ``squash``: how means become
     numbers in [−1, 1].
     """

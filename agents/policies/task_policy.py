@@ -15,7 +15,7 @@ from agents.weights import learned
 class TaskPolicy:
     """An actor in a task: decisions held as it was trained to, its memory going from step to step.
 
-    It draws choices where it was trained to (the likeliest of equals would collide for ever on a
+    It draws actions where it was trained to (the likeliest of equals would collide for ever on a
     channel); else it takes the likeliest, or the mean. An episode's first step is noticed; one
     object is good for one set of worlds at a time.
     """
@@ -44,9 +44,13 @@ class TaskPolicy:
         more = relations(seen.task, seen.memory, actor.network)
         out, self._memory = actor(seen.observation, seen.mask, more, self._memory)
         actor.train(training)
+        drawn = actor.architecture["sampled"]
         if not actor.discrete:
+            if drawn:
+                noise = torch.randn(out.shape, generator=seen.random)
+                out = out + actor.scale(out) * noise
             return actor.squash(out)
-        if not self.actor.architecture["sampled"]:
+        if not drawn:
             choice = out.argmax(-1)
         else:
             flat = out.softmax(-1).flatten(0, 1)

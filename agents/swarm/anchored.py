@@ -17,10 +17,13 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
+from agents.models.measurements import make_measurements
 from agents.models.process import make_process
 from agents.swarm import joint
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.centres import Centres
+from agents.swarm.considered import Moments, after_step
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import Links
 from agents.swarm.marginals import block_diagonal, range_update, with_marginals
@@ -37,11 +40,13 @@ _MIN_VARIANCE = 1e-6  # m² per axis: of a position that is believed to be exact
 
 
 class AnchoredBelief(TensorClass):
-    """State and error covariance of each UAV's motion model, steps taken, and the UAVs' part of the
-    swarm filter's belief in the team and the anchors; batch (B, N)."""
+    """State and error covariance of each UAV's motion model, what sensors' biases have made of the
+    error (see ``agents.models.biases``), steps taken, and the UAVs' part of the swarm filter's
+    belief in the team and the anchors; batch (B, N)."""
 
     state: Float64[Tensor, "B N S"]
     covariance: Float64[Tensor, "B N E E"]
+    considered: Float64[Tensor, "B N E G"]
     step: Int64[Tensor, "B N"]
     swarm: SwarmBelief
 
@@ -76,6 +81,8 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         if self.swarm.window:
             raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
+        models = make_measurements(believed)
+        self.biases = Biases([m for m in models if m.bias_std], self.process.dt)
 
     @property
     def exchanges(self) -> bool:
@@ -91,6 +98,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         return AnchoredBelief(
             state=state,
             covariance=covariance,
+            considered=self.biases.initial(observation, covariance),
             step=torch.zeros(state.shape[:2], dtype=torch.int64, device=state.device),
             swarm=_uavs(swarm, state.shape[1]),
             batch_size=state.shape[:2],
@@ -121,11 +129,21 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         recursive = self.swarm.recursive
         take = self.navigation.replace_marginal if recursive else self.navigation.update
         state, covariance = take(state, covariance, position, posterior)
+        considered = after_step(
+            self.biases,
+            self.process,
+            belief.considered,
+            Moments(belief.state, belief.covariance),
+            Moments(state, covariance),
+            dt,
+            observation,
+        )
         after = build(
             AnchoredBelief,
             shape,
             state=state,
             covariance=covariance,
+            considered=considered,
             step=belief.step + 1,
             swarm=_uavs(updated, shape[1]),
         )
@@ -134,7 +152,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             shape,
             position=state[..., :d],
             velocity=state[..., d : 2 * d],
-            covariance=covariance[..., :d, :d],
+            covariance=reported(covariance, considered)[..., :d, :d],
         )
         return after, estimate
 
@@ -157,7 +175,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             arena=replace(self.believed.arena, n_uavs=members),
             slots=members,
             process=InsDriven(),
-            sensors=(Ranging(ranging.noise), Ins(std=0.0), fixes),
+            sensors=(Ranging(replace(ranging.noise, bias_std=0.0)), Ins(std=0.0), fixes),
         )
 
     def _member_observation(

@@ -27,7 +27,8 @@ class SwarmBelief(TensorClass):
     errors and of how links change between line of sight and NLOS, the same for all UAVs;
     ``link_memory``: what the confidence remembers of each link (of width 0: nothing);
     ``localizable``: connected to at least d + 1 anchors; ``window`` of past steps (of length 0:
-    none); ``delays`` of antennas and clocks.
+    none); ``delays`` of antennas and clocks; ``considered``: what sensors' biases have made of the
+    error (see ``agents.models.biases``; of width 0: none are believed).
     """
 
     state: Float64[Tensor, "B N S"]
@@ -41,6 +42,7 @@ class SwarmBelief(TensorClass):
     localizable: Bool[Tensor, "B N"]
     window: RangeWindow
     delays: Delays
+    considered: Float64[Tensor, "B N e G"]
 
 
 @dataclass(frozen=True)

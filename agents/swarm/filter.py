@@ -8,10 +8,13 @@ from torch import Tensor
 
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
+from agents.models.biases import Biases, reported
+from agents.models.measurements import UavRanges
 from agents.models.process import make_process
 from agents.swarm import calibration, delays, ins_bias, joint, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
+from agents.swarm.considered import Moments, after_step
 from agents.swarm.delays import Delays
 from agents.swarm.links import Links, connected, lengths, links_of
 from agents.swarm.window import RangeWindow
@@ -53,6 +56,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
         if sensor is None or sensor.tags:
             raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
         self.std, self.process = sensor.noise.std, make_process(believed)
+        self.range_models = [UavRanges(sensor)]
         self.confidence = CONFIDENCES[confidence](self.std)
         ins = believed.sensor(Ins) if isinstance(believed.process, InsDriven) else None
         self.ins = ins if bias and ins is not None and ins.bias > 0 else None
@@ -88,6 +92,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             localizable=torch.zeros(shape, dtype=torch.bool, device=state.device),
             window=window.empty(position, covariance, self.window),
             delays=delays.initial(position, self.clock),
+            considered=self.biases.initial(observation, self._marginals(variance)),
             batch_size=shape,
         )
 
@@ -98,7 +103,30 @@ class SwarmFilter(Localizer[SwarmBelief]):
     def step(self, belief: SwarmBelief, observation: Observation) -> tuple[SwarmBelief, Estimate]:
         inputs = self.predict(belief, observation)
         solution = self.solve(belief, inputs)
-        return self.update(belief, inputs, solution), self.estimate(inputs, solution)
+        after, estimate = self.update(belief, inputs, solution), self.estimate(inputs, solution)
+        if not self.biases:
+            return after, estimate
+        considered = after_step(
+            self.biases,
+            self.process,
+            belief.considered,
+            Moments(belief.state, self._marginals(belief.variance)),
+            Moments(after.state, estimate.covariance),
+            elapsed(self.process, belief.step).double(),
+            observation,
+        )
+        honest = reported(estimate.covariance, considered)
+        return after.replace(considered=considered), estimate.replace(covariance=honest)
+
+    @property
+    def biases(self) -> Biases:
+        """Those of ranges between UAVs."""
+        return Biases(self.range_models, self.process.dt)
+
+    def _marginals(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N d d"]:
+        """Covariances of positions with one variance (m²) for all axes."""
+        eye = torch.eye(self.process.dim, dtype=variance.dtype, device=variance.device)
+        return variance[..., None, None] * eye
 
     def predict(self, belief: SwarmBelief, observation: Observation) -> StepInput:
         """Dead reckoning to the observation's step, and the step's fixes and links."""
@@ -167,6 +195,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             localizable=_localizable(inputs, d),
             window=belief.window if solution.window is None else solution.window,
             delays=inputs.delays if solution.delays is None else solution.delays,
+            considered=belief.considered,
         )
 
     def estimate(self, inputs: StepInput, solution: Solution) -> Estimate:

@@ -44,7 +44,11 @@ class TrustingEkf(CooperativeEkf):
         bank: BankOptions = BankOptions(),  # noqa: B008
         **options: Any,
     ) -> Localizer[Any]:
-        """The filter, or a bank of it and one with Huber's weights."""
+        """The filter, or a bank of it and one with Huber's weights. ValueError for a fusion that it
+        does not have."""
+        cls.require_sense(options)
+        if options.get("fusion") == "pairwise" and believed.message_delay:
+            raise ValueError("fusion=pairwise is not allowed with message_delay: only for ekf")
         one = cls(believed, bank=bank, **options)
         return Bank(one, bank) if bank.bank else one
 

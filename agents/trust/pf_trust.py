@@ -28,6 +28,8 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
         **options: Any,
     ) -> None:
         super().__init__(believed, **options)
+        if self.printed:
+            raise ValueError("variant=paper trusts all measurements alike: apf and pfnn have it")
         self.screen = learned_screen(self.process, self.models, weights, bank.bank, options)
 
     @classmethod

@@ -101,13 +101,17 @@ class Localization:
         self._use(belief, observation, last, speed)
 
     def move(self, places: Float[Tensor, "B N d"]) -> None:
-        """One step on, to agents at ``places``."""
-        if self._belief is None:
-            raise ValueError("Localized: reset it before its first step")
+        """One step on, to agents at ``places``. ValueError before the first ``restart``."""
+        self.require_start()
         self._take(places)
         self.world.advance(self._estimate.action(), Commands(motion=self._true))
         last = self.heard + self.dt * self.heard_velocity
         self._use(self._belief, self.world.observation(), last, self.heard_velocity)
+
+    def require_start(self) -> None:
+        """Raise ValueError before the first ``restart``."""
+        if self._belief is None:
+            raise ValueError("Localized: reset it before its first step")
 
     def _take(self, places: Float[Tensor, "B N d"]) -> None:
         """Places in m, in the world's frame."""

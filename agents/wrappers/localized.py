@@ -11,7 +11,6 @@ from torch import Tensor
 
 from agents.wrappers.adapter import Adapter, NoiseSeeds
 from agents.wrappers.entries import replaced
-from agents.wrappers.localization import Localization
 from coloc_env.seeding import checked_seed
 
 
@@ -42,8 +41,6 @@ class Localized(ParallelEnv[Any, Any, Any]):
         self.env, self.task, self._std = env, task, std
         self.metadata = env.metadata
         self.possible_agents = list(env.possible_agents)
-        self._localizer, self._overrides = localizer, overrides
-        self.team: Localization | None = None
         self._seeds = NoiseSeeds()
         dim = len(task.low)
         self.observation_spaces = {
@@ -51,7 +48,7 @@ class Localized(ParallelEnv[Any, Any, Any]):
             for agent in self.possible_agents
         }
         nowhere = torch.zeros(1, len(self.possible_agents), dim)
-        task.localization(localizer, nowhere, **overrides)  # what does not fit is refused now
+        self.team = task.localization(localizer, nowhere, **overrides)
 
     @staticmethod
     def _space(agent: Any, space: spaces.Space[Any], extra: int) -> spaces.Box:
@@ -84,21 +81,17 @@ class Localized(ParallelEnv[Any, Any, Any]):
             self._seeds.next = checked_seed(seed, "Localized")
         observations, infos = self.env.reset(seed=seed, options=options)
         places = self.task.places(self.env)
-        if self.team is None:
-            self.team = self.task.localization(self._localizer, places, **self._overrides)
         self.team.restart(places, self._seeds.take(1))
         return self._known(observations, places), self._infos(infos)
 
     def step(self, actions: dict[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
-        if self.team is None:
-            raise ValueError("Localized: reset it before its first step")
+        self.team.require_start()
         observations, rewards, ended, cut, infos = self.env.step(actions)
         places = self.task.places(self.env)
         self.team.move(places)
         return self._known(observations, places), rewards, ended, cut, self._infos(infos)
 
     def _known(self, observations: dict[Any, np.ndarray], places: Tensor) -> dict[Any, np.ndarray]:
-        assert self.team is not None
         found = {}
         for i, agent in enumerate(self.possible_agents):
             if agent not in observations:
@@ -112,7 +105,6 @@ class Localized(ParallelEnv[Any, Any, Any]):
         return found
 
     def _infos(self, infos: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
-        assert self.team is not None
         error = dict(zip(self.possible_agents, self.team.error[0].tolist(), strict=True))
         return {a: {**info, "localization_error": error[a]} for a, info in infos.items()}
 

@@ -26,7 +26,7 @@ def expected_information(
 
     The expectation is the mean over the truth moved by +drawn and −drawn state errors.
     """
-    own, shared = pose_information(sensors, moved(truth, drawn @ pose.mT), _twice(seen))
+    own, shared = pose_information(sensors, moved(truth, drawn @ pose.mT), twice(seen))
     return about_states(pose, _mean(own), None if shared is None else _mean(shared))
 
 
@@ -71,7 +71,7 @@ def moved(truth: Kinematics, errors: Float64[Tensor, "B N D"]) -> Kinematics:
     )
 
 
-def _twice(seen: Observation) -> Observation:
+def twice(seen: Observation) -> Observation:
     return Observation({name: leaf.repeat(2, 1, 1) for name, leaf in seen.leaves.items()})
 
 

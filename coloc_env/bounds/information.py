@@ -88,6 +88,14 @@ def _anchor_ranging(
     sensor: AnchorRanging, truth: Kinematics, seen: Observation
 ) -> Float64[Tensor, "B N D D"]:
     """d = ‖p + R l_a − A_m‖ + noise, for own tag a and anchor m."""
+    rows, weights = anchor_rows(sensor, truth, seen)
+    return _gram(rows.unsqueeze(-2), weights)
+
+
+def anchor_rows(
+    sensor: AnchorRanging, truth: Kinematics, seen: Observation
+) -> tuple[Float64[Tensor, "B N M D"], Float64[Tensor, "B N M"]]:
+    """Derivatives of each range by the pose, and its information, 0 where none arrived."""
     arrived = _mask(seen, "anchor_range_mask").unflatten(-1, (sensor.n_tags, -1))
     tags, jacobian = _tags(truth, sensor.tags)
     toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
@@ -99,7 +107,7 @@ def _anchor_ranging(
         points = _points(seen, "anchor_map", truth).unsqueeze(2)
         each = distance_information(sensor.noise, (tags.unsqueeze(-2) - points).norm(dim=-1))
     weights = arrived * each
-    return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
+    return rows.flatten(2, 3), weights.flatten(2)
 
 
 @own_information.register
@@ -133,6 +141,20 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
     long these make a range, and the clocks' errors count as known: no estimator knows more.
     """
     t = sensor.n_tags
+    links, along, jacobian = range_links(sensor, truth, seen)
+    weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)
+    laplacian = -weights
+    laplacian.diagonal(dim1=1, dim2=2).add_(weights.sum(2).movedim(1, -1))
+    laplacian = laplacian.unflatten(2, (-1, t)).unflatten(1, (-1, t))
+    return torch.einsum("bitxd,bitjsxy,bjsye->bidje", jacobian, laplacian, jacobian)
+
+
+def range_links(
+    sensor: Ranging, truth: Kinematics, seen: Observation
+) -> tuple[Float64[Tensor, "B P P"], Float64[Tensor, "B P P d"], Float64[Tensor, "B N T d D"]]:
+    """Information of the range between any two of the team's P tags, 0 where none arrived, its
+    direction from the second to the first, and the tags' derivatives by the poses."""
+    t = sensor.n_tags
     arrived = _mask(seen, "range_mask").unflatten(-1, (-1, t * t))
     links = _by_uav(arrived, seen).unflatten(-1, (t, t)).transpose(2, 3)  # [B, i, a, j, b]
     links = links.flatten(1, 2).flatten(2, 3)
@@ -146,12 +168,7 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
         apart = points.unsqueeze(2) - points.unsqueeze(1)
         each = distance_information(sensor.noise, apart.norm(dim=-1))
     links = torch.maximum(links, links.transpose(1, 2)) * each
-    along = _unit(points.unsqueeze(2) - points.unsqueeze(1))
-    weights = (links.unsqueeze(-1) * along).unsqueeze(-1) * along.unsqueeze(-2)
-    laplacian = -weights
-    laplacian.diagonal(dim1=1, dim2=2).add_(weights.sum(2).movedim(1, -1))
-    laplacian = laplacian.unflatten(2, (-1, t)).unflatten(1, (-1, t))
-    return torch.einsum("bitxd,bitjsxy,bjsye->bidje", jacobian, laplacian, jacobian)
+    return links, _unit(points.unsqueeze(2) - points.unsqueeze(1)), jacobian
 
 
 @shared_information.register

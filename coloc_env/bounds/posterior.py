@@ -25,6 +25,7 @@ rule out large errors.
 - IMU, INS and odometry noise, of known statistics, is process noise, and so is what missing samples
   of a recording leave unknown. With ``ConstantVelocity`` the
   process noise is the model's: scripted motion is smoother, and a filter may do better than that.
+- Biases of ranges and heights are states of their own, Gauss–Markov as they are drawn.
 - The information that visibility itself holds is left out; a delayed measurement counts as if made
   when it arrives; the landmark that a false match shows is known (see ``information``); a uniform
   prior is taken as a Gaussian (see ``process``).
@@ -37,6 +38,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
+from coloc_env.bounds.biases import LinkBiases, updated
 from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
@@ -90,9 +92,10 @@ def posterior_bound(
         raise ValueError("posterior_bound: no bound is known for a team that is kidnapped")
     steps = scenario.horizon if steps is None else steps
     model = error_model(scenario)
-    joint = scenario.arena.n_uavs * model.pose().shape[1]
+    biases = LinkBiases.of(scenario, cooperative)
+    joint = scenario.arena.n_uavs * model.pose().shape[1] + biases.count
     blocks = [
-        _bound(scenario, model, seeds, steps, cooperative)
+        _bound(scenario, model, biases, seeds, steps, cooperative)
         for seeds in seeds_of("posterior_bound", scenario, runs, seed, steps, joint)
     ]
     mse, scored = (torch.cat(parts) for parts in zip(*blocks, strict=True))
@@ -102,6 +105,7 @@ def posterior_bound(
 def _bound(
     scenario: Scenario,
     model: ErrorModel,
+    biases: LinkBiases,
     seeds: Int64[Tensor, "B"],
     steps: int,
     cooperative: bool,
@@ -114,21 +118,27 @@ def _bound(
     n = scenario.arena.n_uavs if cooperative else 1
     states = (len(seeds), scenario.arena.n_uavs, pose.shape[1])
     sensors = [s for s in true_sensors(scenario) if cooperative or not s.between_uavs]
-    prior = torch.block_diag(*n * [prior_covariance(model, scenario)])
+    prior = torch.block_diag(*n * [prior_covariance(model, scenario)], biases.prior)
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
+    size = n * states[2]  # of a team's errors; its biases follow
     before: Kinematics | None = None
     mse, scored = [], []
     for step, (truth, seen, counts) in enumerate(worlds(scenario, seeds, steps)):
         if before is not None:
             f, q = model.transition(before, truth, seen)
-            covariance = predict(covariance, _by_team(f, n), _by_team(q, n))
+            moved = predict(covariance[:, :size, :size], _by_team(f, n), _by_team(q, n))
+            covariance = biases.predict(covariance, moved, _by_team(f, n))
         root = torch.linalg.cholesky(covariance)
         keys = noise.fold(noise.row_keys(seeds), step)
         white = noise.normal(keys, "bound", states[1] * states[2]).double()
-        drawn = (2**0.5 * root @ white.reshape(len(root), -1, 1)).view(states)
+        drawn = (2**0.5 * root[:, :size, :size] @ white.reshape(len(root), -1, 1)).view(states)
         own, shared = expected_information(sensors, truth, seen, drawn, pose)
-        covariance = update(root, _by_team(own, n), shared)
-        variance = covariance.diagonal(dim1=1, dim2=2).reshape(states)
+        if biases.count:
+            about = biases.information(truth, seen, drawn, pose, n)
+            covariance = updated(root, _by_team(own, n), shared, about)
+        else:
+            covariance = update(root, _by_team(own, n), shared)
+        variance = covariance.diagonal(dim1=1, dim2=2)[:, :size].reshape(states)
         mse.append(variance[..., :dim].sum(-1))
         scored.append(counts)
         before = truth

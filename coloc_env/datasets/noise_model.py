@@ -1,8 +1,9 @@
 """``believed.yaml``: what a team believes of a recording's sensors, and what is corrected by it."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coloc_env.datasets.open_format.yaml_files import Keys, YamlFile
-from coloc_env.datasets.recording import Recording, Table
+from coloc_env.datasets.recording import Floats, Recording, Stamps, Table
 
 MODELS = ("inertial", "wheeled", "constant_velocity")
 _T = TypeVar("_T")
@@ -170,33 +171,9 @@ def corrected(recording: Recording, model: NoiseModel) -> Recording:
     """The recording without the systematic errors that are believed: biases taken off, stamps
     moved to when it was measured, refined places in the map."""
     streams = dict(recording.streams)
-    for stream, column, names in (
-        ("anchor_ranges", 1, recording.anchor_names),
-        ("uav_ranges", 1, recording.robots),
-    ):
-        if stream in streams:
-            ranges: RangeModel = getattr(model, stream)
-            streams[stream] = tuple(
-                _ranges_corrected(table, robot, names, column, ranges)
-                for robot, table in zip(recording.robots, streams[stream], strict=True)
-            )
-    for stream in ("landmark_bearings", "uav_bearings"):
-        if stream in streams:
-            own = getattr(model, stream).robots
-            streams[stream] = tuple(
-                _less(table, (0.0, off.range, off.bearing))
-                for table, off in (
-                    (table, own.get(robot, SightingBias()))
-                    for robot, table in zip(recording.robots, streams[stream], strict=True)
-                )
-            )
-    if "imu" in streams:
-        streams["imu"] = tuple(
-            _in_body(table, model.imu.robots.get(robot, ImuBias()))
-            for robot, table in zip(recording.robots, streams["imu"], strict=True)
-        )
-    if "height" in streams:
-        streams["height"] = tuple(_less(t, (model.height.bias,)) for t in streams["height"])
+    for stream, corrections in stream_corrections(recording, model).items():
+        tables = zip(corrections, streams[stream], strict=True)
+        streams[stream] = tuple(correct(table) for correct, table in tables)
     anchors, tags = recording.anchors.copy(), recording.tags.copy()
     for name, place in model.anchors.items():
         anchors[recording.anchor_names.index(name)] = place
@@ -205,18 +182,34 @@ def corrected(recording: Recording, model: NoiseModel) -> Recording:
     return replace(recording, streams=streams, anchors=anchors, tags=tags)
 
 
+def stream_corrections(
+    recording: Recording, model: NoiseModel
+) -> dict[str, tuple[Callable[[Table], Table], ...]]:
+    """What takes the systematic errors off each robot's tables, by stream, where there are any."""
+    robots, found = recording.robots, dict[str, tuple[Callable[[Table], Table], ...]]()
+    for stream, names in (("anchor_ranges", recording.anchor_names), ("uav_ranges", robots)):
+        ranges: RangeModel = getattr(model, stream)
+        known = [[ranges.of(f"{robot}/{name}") for name in names] for robot in robots]
+        bias = np.array([[link.bias for link in own] for own in known])
+        late = np.array([[round(link.delay * 1e9) for link in own] for own in known], np.int64)
+        if bias.any() or late.any():
+            pairs = zip(bias, late, strict=True)
+            found[stream] = tuple(partial(_ranges_corrected, bias=b, late=t) for b, t in pairs)
+    for stream in ("landmark_bearings", "uav_bearings"):
+        own = getattr(model, stream).robots
+        off = [own.get(robot, SightingBias()) for robot in robots]
+        found[stream] = tuple(partial(_less, bias=(0.0, o.range, o.bearing)) for o in off)
+    axes = [model.imu.robots.get(robot, ImuBias()) for robot in robots]
+    found["imu"] = tuple(partial(_in_body, off=off) for off in axes)
+    found["height"] = (partial(_less, bias=(model.height.bias,)),) * len(robots)
+    return {stream: found[stream] for stream in found if stream in recording.streams}
+
+
 # ------------------------------------------------------------------ parts
 
 
-def _ranges_corrected(
-    table: Table, robot: str, names: tuple[str, ...], column: int, model: RangeModel
-) -> Table:
-    ends = table.values[:, column].astype(np.int64)
-    known = [model.of(f"{robot}/{name}") for name in names]
-    bias = np.array([link.bias for link in known])
-    late = np.array([round(link.delay * 1e9) for link in known], np.int64)
-    if not (bias.any() or late.any()):
-        return table
+def _ranges_corrected(table: Table, bias: Floats, late: Stamps) -> Table:
+    ends = table.values[:, 1].astype(np.int64)
     values = table.values.copy()
     values[:, -1] -= bias[ends]
     there, time = values[:, -1] > 0, table.time - late[ends]

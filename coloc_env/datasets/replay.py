@@ -8,6 +8,7 @@ from torch import Tensor
 
 from coloc_env.datasets.grid import (
     Grid,
+    Usual,
     bridged,
     held_intervals,
     imu_on,
@@ -16,6 +17,7 @@ from coloc_env.datasets.grid import (
     slots_on,
     truth_on,
     unknown_on,
+    usual,
 )
 from coloc_env.datasets.recording import DataError, Flags, Floats, Recording, Table
 from coloc_env.motion import Arena, RecordedMotion
@@ -103,18 +105,26 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
     )
 
 
-def recorded_imu(recording: Recording, grid: Grid, sensor: Imu, bias: Floats) -> RecordedImu:
+def recorded_imu(
+    recording: Recording,
+    grid: Grid,
+    sensor: Imu,
+    bias: Floats,
+    like: Sequence[Usual] | None = None,
+) -> RecordedImu:
     """Leaf ``imu`` with a calibrated bias (gyro rad/s, accel m/s²; [N, 6]) taken off, and where
-    samples are missing leaf ``imu_unknown``."""
-    robots, unknown = [], []
-    for table, own in zip(recording.streams["imu"], bias, strict=True):
-        whole, missing = bridged(table, _IMU_HELD)
-        gyro, accel = np.sqrt(table.values.var(0).reshape(2, 3).mean(1))  # an axis
-        leaf = imu_on(grid, whole, own[:3])
-        leaf[:, :3] -= own[3:]
-        robots.append(leaf)
+    samples are missing leaf ``imu_unknown``. ``like``: what each robot's samples are like (none:
+    as those are that are there)."""
+    tables = recording.streams["imu"]
+    held, unknown = [], []
+    for table, own in zip(tables, like or map(usual, tables), strict=True):
+        whole, missing = bridged(table, _IMU_HELD, own.mean)
+        gyro, accel = np.sqrt(own.variance.reshape(2, 3).mean(1))  # an axis
+        held.append(whole)
         unknown.append(unknown_on(grid, missing, np.array((accel, gyro))))
-    series = {"imu": _series(robots)}
+    leaf = imu_on(grid, held, bias[:, :3])
+    leaf[..., :3] -= bias[:, 3:]
+    series = {"imu": Series(torch.from_numpy(leaf).to(torch.float32))}
     if np.any(unknown):
         series["imu_unknown"] = _series(unknown)
     return RecordedImu(sensor, series)
@@ -125,7 +135,8 @@ def recorded_imu_samples(
 ) -> RecordedImu:
     """``recorded_imu``, and beside the mean over each step its samples, less their bias."""
     held = [
-        held_intervals(grid, bridged(table, _IMU_HELD)[0]) for table in recording.streams["imu"]
+        held_intervals(grid, bridged(table, _IMU_HELD, table.values.mean(0))[0])
+        for table in recording.streams["imu"]
     ]
     width = max(durations.shape[1] for _, durations in held)
     samples, durations = [], []
@@ -148,18 +159,23 @@ def recorded_odometry(
     delay: float = 0.0,
     scale: float = 1.0,
     turn_scale: float | None = None,
+    like: Sequence[Usual] | None = None,
 ) -> RecordedOdometry:
     """Leaf ``odometry``: samples that stand for ``held`` s at most, taken to act ``delay`` s later,
     ``scale`` times as strongly (turns: ``turn_scale``, by default the same); and where samples are
-    missing leaf ``odometry_unknown``."""
+    missing leaf ``odometry_unknown``. ``like``: what each robot's samples, as they were read, are
+    like (none: as those are that are there)."""
     robots, unknown = [], []
-    for table in recording.streams["odometry"]:
-        values = scale * table.values
+    for robot, table in enumerate(recording.streams["odometry"]):
+        factor = np.full(table.values.shape[1], scale)
         if turn_scale is not None:
-            values[:, -1] = turn_scale * table.values[:, -1]
-        acting = Table(table.time + round(delay * 1e9), values, table.columns)
-        whole, missing = bridged(acting, held)
-        spread = acting.values.std(0)
+            factor[-1] = turn_scale
+        acting = Table(table.time + round(delay * 1e9), factor * table.values, table.columns)
+        if like is None:
+            mean, spread = acting.values.mean(0), acting.values.std(0)
+        else:
+            mean, spread = factor * like[robot].mean, factor * np.sqrt(like[robot].variance)
+        whole, missing = bridged(acting, held, mean)
         sideways = spread[1] if len(spread) == 3 else 0.0
         robots.append(odometry_on(grid, whole))
         unknown.append(unknown_on(grid, missing, np.array((spread[0], sideways, spread[-1]))))

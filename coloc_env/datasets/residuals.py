@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table, Track
 
 _HOLE = 250_000_000  # ns between samples of truth that are bridged
-_FEW, _MANY = 20, 100  # ranges of a link, and of all, of fewer of which no delay is told
+_FEW, _MANY = 20, 100  # ranges of a link, and of all, of fewer of which no delay is estimated
 _CHANGE = 1_000_000_000  # ns over which errors are watched change
 _FALLS = 0.95  # of a deviation: what a delay must make of it
 _LATEST = 600_000_000  # ns, the largest delay that is looked for

@@ -1,8 +1,8 @@
 """``replay-v0``: a recording of one's own, in the open format."""
 
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,7 @@ import numpy as np
 
 from coloc_env.datasets import Recording
 from coloc_env.datasets.folders import Version, expanded, version
-from coloc_env.datasets.grid import Grid, aligned, common_grid
+from coloc_env.datasets.grid import Grid, Usual, aligned, common_grid, usual
 from coloc_env.datasets.noise_model import NoiseModel, corrected, read_noise_model
 from coloc_env.datasets.open_format import FILE, read_recording
 from coloc_env.datasets.recording import DataError
@@ -57,7 +57,9 @@ from coloc_env.sensors import (
     UavBearings,
 )
 
-Pair = tuple[Sensor, Sensor]
+Pair = tuple[RecordedSensor, Sensor]
+Make = Callable[[Recording, Grid], Pair]
+Drive = Callable[[Recording, Grid, Sequence[Usual] | None], Pair]
 _HELD, _USUAL = 1.0, 10.0  # s, usual intervals: for the longer a sample of odometry stands
 _UNKNOWN = np.pi / 3**0.5  # rad: standard deviation of an attitude of which nothing is known
 
@@ -86,29 +88,17 @@ def replay_own(
         raise ValueError("path=none is not allowed: the folder of a recording is needed")
     folder = expanded(path)
     recording = _read(version(folder), folder)
-    model = _believed(recording, folder, believed)
+    model = own_beliefs(recording, folder / FILE, believed)
     recording = corrected(recording, model)
-    kind = _kind(recording, model.motion.model if process == "auto" else process)
-    driver = {"inertial": ("imu",), "wheeled": ("odometry",)}.get(kind, ())
+    team = own_team(recording, model, process)
+    driver = (team.driver,) if team.driver else ()
     whole = common_grid(recording, replay.dt, driver)
-    pairs, used = _sensors(recording, model)
-    grid = replay.cut(aligned(whole, recording, tuple(used)))
-    sensors = [make(grid) for make in pairs]
-    settings: Process = ConstantVelocity(model.motion.accel_std, model.motion.damping or None)
-    if kind == "inertial":
-        imu = model.imu
-        own, no_bias = Imu(imu.accel_std, imu.gyro_std), np.zeros((len(recording.robots), 6))
-        sensors.append((recorded_imu(recording, grid, own, no_bias), own))
-        settings = Inertial(imu.accel_bias, imu.gyro_bias, imu.accel_walk, imu.gyro_walk)
-    elif kind == "wheeled":
-        wheels = model.odometry
-        read = Odometry(wheels.forward_std, wheels.left_std, wheels.turn_std, wheels.relative)
-        sensors.append((_odometry(recording, grid, read, model), read))
-        settings = Wheeled()
-    beliefs = [belief for _, belief in sensors]
-    if model.motion.slow_flight and kind != "wheeled":
-        beliefs.append(SlowFlight(model.motion.slow_flight))
-    _name_unused(recording, {*used, *driver})
+    grid = replay.cut(aligned(whole, recording, tuple(team.sensors)))
+    sensors = [make(recording, grid) for make in team.sensors.values()]
+    if team.driver:
+        sensors.append(team.drive(recording, grid, None))
+    beliefs = (*(belief for _, belief in sensors), *team.assumed)
+    _name_unused(recording, {*team.sensors, *driver})
     recording = level(recording, grid)
     return Scenario(
         name="replay-v0",
@@ -117,17 +107,56 @@ def replay_own(
         motion=recorded_motion(recording, grid),
         sensors=tuple(sensor for sensor, _ in sensors),
         network=Network(),
-        prior=_prior(recording, prior),
-        process=settings,
-        believed_sensors=tuple(beliefs),
+        prior=own_prior(recording, prior),
+        process=team.process,
+        believed_sensors=beliefs,
         reward=reward,
     )
 
 
-def _believed(recording: Recording, folder: Path, believed: str | None) -> NoiseModel:
+@dataclass(frozen=True)
+class OwnTeam:
+    """How the team of a recording of one's own works: what makes each sensor that corrects an
+    estimate on a grid, and the belief about it, by its stream; likewise (``drive``) the sensor that
+    drives the motion model (``driver``: its stream, "" for none); what else is assumed."""
+
+    process: Process
+    sensors: Mapping[str, Make]
+    driver: str
+    drive: Drive
+    assumed: tuple[Sensor, ...]
+
+
+def own_team(recording: Recording, model: NoiseModel, process: str = "auto") -> OwnTeam:
+    """The team of a recording, by what its streams are and what is believed of them."""
+    kind = _kind(recording, model.motion.model if process == "auto" else process)
+    settings: Process = ConstantVelocity(model.motion.accel_std, model.motion.damping or None)
+    imu, wheels, slow = model.imu, model.odometry, model.motion.slow_flight
+    own = Imu(imu.accel_std, imu.gyro_std)
+    read = Odometry(wheels.forward_std, wheels.left_std, wheels.turn_std, wheels.relative)
+
+    def inertial(recording: Recording, grid: Grid, like: Sequence[Usual] | None) -> Pair:
+        no_bias = np.zeros((len(recording.robots), 6))
+        return recorded_imu(recording, grid, own, no_bias, like), own
+
+    def wheeled(recording: Recording, grid: Grid, like: Sequence[Usual] | None) -> Pair:
+        return _odometry(recording, grid, read, model, like), read
+
+    driver = {"inertial": "imu", "wheeled": "odometry"}.get(kind, "")
+    if kind == "inertial":
+        settings = Inertial(imu.accel_bias, imu.gyro_bias, imu.accel_walk, imu.gyro_walk)
+    elif kind == "wheeled":
+        settings = Wheeled()
+    assumed = (SlowFlight(slow),) if slow and kind != "wheeled" else ()
+    drive = wheeled if kind == "wheeled" else inertial
+    return OwnTeam(settings, _sensors(recording, model), driver, drive, assumed)
+
+
+def own_beliefs(recording: Recording, setup: Path, believed: str | None) -> NoiseModel:
+    """What is believed: as the file ``believed`` says, or else as the ``recording.yaml`` does."""
     if believed is not None:
         return read_noise_model(expanded(believed), recording)
-    return read_noise_model(folder / FILE, recording, "believed")
+    return read_noise_model(setup, recording, "believed")
 
 
 def _kind(recording: Recording, wanted: str) -> str:
@@ -150,39 +179,37 @@ def _kind(recording: Recording, wanted: str) -> str:
     return wanted
 
 
-def _sensors(
-    recording: Recording, model: NoiseModel
-) -> tuple[list[Callable[[Grid], Pair]], list[str]]:
-    """What makes, on a grid, each sensor that corrects an estimate and the belief about it; and the
-    streams that they are of."""
-    makers: dict[str, Callable[[Grid], Pair]] = {}
+def _sensors(recording: Recording, model: NoiseModel) -> dict[str, Make]:
+    """What makes, on a grid, each sensor that corrects an estimate and the belief about it, by the
+    stream that it is of."""
+    makers: dict[str, Make] = {}
     tags = lever_arms(recording) if recording.tags.shape[1] else ()
     if "anchor_ranges" in recording.streams:
         places = tuple(map(tuple, recording.anchors.tolist()))
         anchors = AnchorRanging(places, RangeNoise(std=model.anchor_ranges.std), tags)
-        makers["anchor_ranges"] = lambda g: (recorded_anchor_ranges(recording, g, anchors), anchors)
+        makers["anchor_ranges"] = lambda r, g: (recorded_anchor_ranges(r, g, anchors), anchors)
     if "uav_ranges" in recording.streams:
         ranging = Ranging(RangeNoise(std=model.uav_ranges.std), tags)
-        makers["uav_ranges"] = lambda g: (recorded_ranges(recording, g, ranging), ranging)
+        makers["uav_ranges"] = lambda r, g: (recorded_ranges(r, g, ranging), ranging)
     if "landmark_bearings" in recording.streams:
         own = model.landmark_bearings
         seen = LandmarkBearings(len(recording.landmarks), own.range_std, own.bearing_std)
-        makers["landmark_bearings"] = lambda g: _bearings(recording, g, seen)
+        makers["landmark_bearings"] = lambda r, g: _bearings(r, g, seen)
     if "uav_bearings" in recording.streams:
         met = UavBearings(model.uav_bearings.range_std, model.uav_bearings.bearing_std)
-        makers["uav_bearings"] = lambda g: _bearings(recording, g, met)
+        makers["uav_bearings"] = lambda r, g: _bearings(r, g, met)
     if "landmark_vectors" in recording.streams:
         count, std = len(recording.landmarks), model.landmark_vectors.std
         places = tuple(map(tuple, recording.landmarks.tolist()))
         vectors = Landmarks(count, std, radius=1e4, positions=places)
-        makers["landmark_vectors"] = lambda g: (recorded_landmarks(recording, g, vectors), vectors)
+        makers["landmark_vectors"] = lambda r, g: (recorded_landmarks(r, g, vectors), vectors)
     if "height" in recording.streams:
         height = Height(model.height.std)
-        makers["height"] = lambda g: (recorded_height(recording, g, height), height)
+        makers["height"] = lambda r, g: (recorded_height(r, g, height), height)
     if "position_fix" in recording.streams:
         fix = PositionFix(model.position_fix.std, len(recording.robots))
-        makers["position_fix"] = lambda g: (recorded_fixes(recording, g, fix), fix)
-    return list(makers.values()), list(makers)
+        makers["position_fix"] = lambda r, g: (recorded_fixes(r, g, fix), fix)
+    return makers
 
 
 def _bearings(recording: Recording, grid: Grid, sensor: LandmarkBearings | UavBearings) -> Pair:
@@ -192,17 +219,20 @@ def _bearings(recording: Recording, grid: Grid, sensor: LandmarkBearings | UavBe
 
 
 def _odometry(
-    recording: Recording, grid: Grid, sensor: Odometry, model: NoiseModel
+    recording: Recording,
+    grid: Grid,
+    sensor: Odometry,
+    model: NoiseModel,
+    like: Sequence[Usual] | None,
 ) -> RecordedSensor:
     wheels = model.odometry
-    tables = recording.streams["odometry"]
-    usual = max(float(np.median(np.diff(table.time))) * 1e-9 for table in tables)
-    held = max(_HELD, _USUAL * usual)
+    interval = max(each.interval for each in like or map(usual, recording.streams["odometry"]))
+    held = max(_HELD, _USUAL * interval)
     corrections = (wheels.delay, wheels.scale, wheels.turn_scale)
-    return recorded_odometry(recording, grid, sensor, held, *corrections)
+    return recorded_odometry(recording, grid, sensor, held, *corrections, like)
 
 
-def _prior(recording: Recording, prior: PriorOptions) -> Prior:
+def own_prior(recording: Recording, prior: PriorOptions) -> Prior:
     """As the options say where the start is known; else uniform, and of no known attitude."""
     place, attitude = spread_of_start(recording)
     if not place and prior.prior == "gaussian":

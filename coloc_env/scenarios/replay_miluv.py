@@ -24,12 +24,11 @@ from coloc_env.options import (
     WhiteAcceleration,
 )
 from coloc_env.scenario import ConstantVelocity, Inertial, PriorOptions, Process, Reward, Scenario
-from coloc_env.scenarios.parts.replays import ReplayOptions
+from coloc_env.scenarios.parts.replays import BiasOptions, ReplayOptions
 from coloc_env.sensors import (
     AnchorRanging,
     Height,
     ImuOptions,
-    RangeNoise,
     Ranging,
     Sensor,
     SlowFlight,
@@ -44,10 +43,12 @@ def replay_miluv(
     slow_flight: PositiveSpeed = 1.2,
     range_std: Metres = 0.15,
     height_std: Metres = 0.15,
+    height_bias_std: Metres = 0.15,
     velocity_accel_std: WhiteAcceleration = 0.6,
     damping: PositiveSeconds | None = 1.0,
     reward: Reward = "error",
     replay: ReplayOptions = ReplayOptions(),
+    biases: BiasOptions = BiasOptions(),
     imu: ImuOptions = ImuOptions(accel_std=0.2, gyro_std=0.005),
     prior: PriorOptions = PriorOptions(prior_std=0.5),
 ) -> Scenario:
@@ -60,7 +61,8 @@ def replay_miluv(
     ``process="constant_velocity"`` leaves the IMU out: velocity driven by ``velocity_accel_std``,
     damped over ``damping`` s; the sequences without IMU need it. The flight is too short to tune on
     one part and score on another: the noise settings were chosen on all of it, and the result is
-    flat around them.
+    flat around them. Biases of ranges are believed to be those of ``replay-hanyang-v0``; heights
+    are off by ``height_bias_std`` m, about what they are here (0.11 m RMS over 10 s).
     """
     recording = replay.load("miluv")
     if process == "inertial" and "imu" not in recording.streams:
@@ -68,12 +70,12 @@ def replay_miluv(
     drivers = ("imu",) if process == "inertial" else ()
     grid = replay.cut(common_grid(recording, replay.dt, drivers))
     tags = lever_arms(recording)
-    error = RangeNoise(std=range_std)
+    error = biases.noise(range_std)
     anchors = AnchorRanging(tuple(map(tuple, recording.anchors.tolist())), error, tags)
     sensors = [recorded_anchor_ranges(recording, grid, anchors)]
     believed: list[Sensor] = [anchors]
     if "height" in recording.streams:
-        height = Height(height_std)
+        height = Height(height_std, bias_std=height_bias_std, bias_time=biases.range_bias_time)
         sensors.append(recorded_height(recording, grid, height))
         believed.append(height)
     if "uav_ranges" in recording.streams:

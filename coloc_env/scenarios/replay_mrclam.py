@@ -10,7 +10,16 @@ from coloc_env.datasets.replay import (
     recorded_odometry,
 )
 from coloc_env.network import Network
-from coloc_env.options import AngularRate, Factor, Metres, Radians, Ratio, Seconds, Speed
+from coloc_env.options import (
+    AngularRate,
+    Factor,
+    Metres,
+    PositiveSeconds,
+    Radians,
+    Ratio,
+    Seconds,
+    Speed,
+)
 from coloc_env.scenario import PriorOptions, Reward, Scenario, Wheeled
 from coloc_env.scenarios.parts.replays import ReplayOptions
 from coloc_env.sensors import (
@@ -31,6 +40,8 @@ def replay_mrclam(
     odometry_scale: Factor = 1.0,
     range_std: Metres = 0.2,
     bearing_std: Radians = 0.04,
+    sighting_bias: Ratio = 1.0,
+    bias_time: PositiveSeconds = 100.0,
     reward: Reward = "error",
     replay: ReplayOptions = ReplayOptions(),
     prior: PriorOptions = PriorOptions(prior_std=0.1),
@@ -40,13 +51,18 @@ def replay_mrclam(
 
     Odometry is the commanded velocity, used as it is; ``odometry_delay=0.25`` (s) and
     ``odometry_scale=0.93`` correct what the first 250 s show of it. The noise settings are the
-    team's belief, chosen on those 250 s.
+    team's belief, chosen on those 250 s. Sightings are believed to have biases ``sighting_bias``
+    times as large as their noise, over ``bias_time`` s (ranges, in those 250 s: 0.15 m RMS over
+    10 s).
     """
     recording = replay.load("mrclam")
     grid = replay.cut(common_grid(recording, replay.dt, ("odometry",)))
     odometry = Odometry(forward_std, 0.5 * forward_std, turn_std, odometry_relative)
-    landmarks = LandmarkBearings(len(recording.landmarks), range_std, bearing_std)
-    robots = UavBearings(range_std, bearing_std)
+    bias = sighting_bias * range_std, sighting_bias * bearing_std
+    landmarks = LandmarkBearings(
+        len(recording.landmarks), range_std, bearing_std, bias_std=bias, bias_time=bias_time
+    )
+    robots = UavBearings(range_std, bearing_std, bias_std=bias, bias_time=bias_time)
     seen, depth = recorded_bearings(recording, grid, landmarks)
     landmarks = replace(landmarks, depth=depth)
     met, depth = recorded_bearings(recording, grid, robots)

@@ -8,8 +8,8 @@ from coloc_env.datasets.replay import arena_of, recorded_motion, recorded_ranges
 from coloc_env.network import Network
 from coloc_env.options import Metres, PositiveCount, Seconds, WhiteAcceleration
 from coloc_env.scenario import ConstantVelocity, InsDriven, PriorOptions, Process, Reward, Scenario
-from coloc_env.scenarios.parts.replays import ReplayOptions
-from coloc_env.sensors import InsOptions, PositionFix, RangeNoise, Ranging, Sensor
+from coloc_env.scenarios.parts.replays import BiasOptions, ReplayOptions
+from coloc_env.sensors import InsOptions, PositionFix, Ranging, Sensor
 
 
 def replay_tiers(
@@ -24,6 +24,7 @@ def replay_tiers(
     calibration: Seconds = 60.0,
     reward: Reward = "error",
     replay: ReplayOptions = ReplayOptions(dt=0.138),
+    biases: BiasOptions = BiasOptions(),
     ins: InsOptions = InsOptions(ins_std=0.05, ins_bias=0.01),
     prior: PriorOptions = PriorOptions(prior_std=0.5),
 ) -> Scenario:
@@ -48,6 +49,7 @@ def replay_tiers(
     ``calibrated``: each pair's ranges are made shorter by their median error in the recording's
     first ``calibration`` s, by OptiTrack, whatever ``span`` is replayed; not ``calibrated``, they
     are 0.19 to 0.49 m too long. ``held``: ranges that repeat the one before are delivered too.
+    Biases are believed to be those of ``replay-hanyang-v0``.
     Calibration and ``range_std`` were chosen on the first 60 s: ``span=60:208`` is what nothing was
     fitted on.
     """
@@ -72,7 +74,7 @@ def replay_tiers(
     if process == "ins":
         model = InsDriven()
         own = (ins.sensor, *own)
-    ranging = Ranging(RangeNoise(std=range_std))
+    ranging = Ranging(biases.noise(range_std))
     return Scenario(
         name="replay-tiers-v0",
         arena=arena_of(recording, grid, margin=1.0),

@@ -1,5 +1,6 @@
 """Range and bearing in the plane: to landmarks, and to other robots that a camera identifies."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,7 +20,10 @@ from coloc_env.sensors.base import (
     squared_norm,
     usable,
 )
+from coloc_env.sensors.errors.persistence import gauss_markov
 from coloc_env.sensors.landmarks import uniform_points
+
+Biases = tuple[float, float]
 
 
 def range_bearing(
@@ -33,13 +37,46 @@ def range_bearing(
     return torch.stack((noisy[..., 0], wrap_angle(noisy[..., 1])), -1)
 
 
+def sighting_biases(
+    sensor: "LandmarkBearings | UavBearings", window: Window, links: int, stream: str
+) -> Float32[Tensor, "R K N D*l 2"] | None:
+    """Biases of the range (m) and bearing (rad) of what each UAV sees on so many links, the same
+    for all measurements of a step; None where there are none."""
+    if not any(sensor.bias_std):
+        return None
+    n = window.layout.arena.n_uavs
+    numbers = torch.arange(n * links * 2, device=window.rows.device).view(n, links, 2)
+    time, first = sensor.bias_time / window.layout.arena.dt, window.steps[:, 0]
+    count = window.steps.shape[1]
+    drawn = gauss_markov(window.rows, first, count, numbers, f"{stream}.bias", time)
+    return (drawn * drawn.new_tensor(sensor.bias_std)).repeat(1, 1, 1, sensor.depth, 1)
+
+
+def _biased(
+    seen: Float32[Tensor, "*s 2"], bias: Float32[Tensor, "*s 2"] | None
+) -> Float32[Tensor, "*s 2"]:
+    """Ranges (m) and bearings (rad) with their biases."""
+    if bias is None:
+        return seen
+    seen = seen + bias
+    return torch.stack((seen[..., 0], wrap_angle(seen[..., 1])), -1)
+
+
+def _require_biases(sensor: "LandmarkBearings | UavBearings") -> None:
+    sizes = all(0 <= std < math.inf for std in sensor.bias_std)
+    require(sizes, sensor, "bias_std", "standard deviations in m and rad ≥ 0")
+    require(0 < sensor.bias_time < math.inf, sensor, "bias_time", "a time in s > 0")
+
+
 @dataclass(frozen=True)
 class LandmarkBearings(Sensor):
     """Leaves ``landmark_bearings`` [D · L · 2], their ``landmark_bearing_mask`` [D · L] and
     ``landmark_map`` [L · 2]: range (m) and bearing (rad) to each identified landmark.
 
     ``depth`` D: how many measurements of one landmark a step can deliver. ``share``: probability
-    that a landmark within ``radius`` is measured at all in a step.
+    that a landmark within ``radius`` is measured at all in a step. Each UAV's sightings of a
+    landmark have biases of standard deviation ``bias_std`` (m, rad), Gauss–Markov processes whose
+    correlation falls by e in ``bias_time`` s.
     """
 
     count: int = 15
@@ -48,8 +85,11 @@ class LandmarkBearings(Sensor):
     radius: float = 8.0
     share: float = 1.0
     depth: int = 1
+    bias_std: Biases = (0.0, 0.0)
+    bias_time: float = 100.0
 
     def __post_init__(self) -> None:
+        _require_biases(self)
         require(
             self.count >= 1, self, "count", "at least one landmark (leave the sensor out for 0)"
         )
@@ -96,6 +136,7 @@ class LandmarkBearings(Sensor):
         mask = (squared_norm(apart) <= self.radius**2) & (drawn < self.share)
         mask &= window.alive.unsqueeze(-1)
         seen = range_bearing(apart, (self.range_std, self.bearing_std), white)
+        seen = _biased(seen, sighting_biases(self, window, self.count, "bearings"))
         return {
             "landmark_bearings": seen.masked_fill_(~mask.unsqueeze(-1), 0.0).flatten(-2),
             "landmark_bearing_mask": mask.to(torch.float32),
@@ -105,7 +146,8 @@ class LandmarkBearings(Sensor):
 @dataclass(frozen=True)
 class UavBearings(Sensor):
     """Leaves ``uav_bearings`` [D · S · 2] and ``uav_bearing_mask`` [D · S]: range (m) and bearing
-    (rad) to each neighbour slot, each end measuring for itself."""
+    (rad) to each neighbour slot, each end measuring for itself. Biases are those of
+    ``LandmarkBearings``, of each neighbour slot."""
 
     between_uavs = True
 
@@ -113,8 +155,11 @@ class UavBearings(Sensor):
     bearing_std: float = 0.02
     share: float = 1.0
     depth: int = 1
+    bias_std: Biases = (0.0, 0.0)
+    bias_time: float = 100.0
 
     def __post_init__(self) -> None:
+        _require_biases(self)
         require(0 <= self.share <= 1, self, "share", "a probability in [0, 1]")
 
     def leaves(self, layout: Layout) -> dict[str, Leaf]:
@@ -140,6 +185,7 @@ class UavBearings(Sensor):
         )
         std = (self.range_std, self.bearing_std)
         seen = range_bearing(apart, std, white.unflatten(-1, (n, count, 2)))
+        seen = _biased(seen, sighting_biases(self, window, slots, "uav_bearings"))
         return {
             "uav_bearings": seen.masked_fill_(~mask.unsqueeze(-1), 0.0).flatten(-2),
             "uav_bearing_mask": mask.to(torch.float32),

@@ -102,16 +102,23 @@ class Ranging(Sensor):
         distance = tag_distances(tags, others)
         link = noise.fold(keys[..., None, None, None, None], lower * (n * t) + upper)
         pairs = torch.arange(n * t * (n * t + 1) // 2, device=keys.device)
-        obstructed = self.noise.obstructed(window, pairs, "ranging", self.latency)
-        if obstructed is not None:
+
+        def by_pair(x: Tensor | None) -> Tensor | None:
+            if x is None:
+                return None
             among = (upper * (upper + 1) // 2 + lower).expand(distance.shape)
-            obstructed = obstructed.gather(2, among.flatten(2)).view(distance.shape)
+            return x.gather(2, among.flatten(2)).view(distance.shape)
+
+        obstructed = by_pair(self.noise.obstructed(window, pairs, "ranging", self.latency))
+        bias = by_pair(self.noise.biases(window, pairs, "ranging", self.latency))
         blocked = None
         if self.walls:
             own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
             inside = depth(own, theirs, self.walls).to(torch.float32)
             blocked = inside > 0
         ranges, lost = self.noise.sample(distance, link, "ranging", blocked, obstructed)
+        if bias is not None:
+            ranges = ranges.add_(bias)
         if blocked is not None:
             ranges = ranges.add_(inside, alpha=self.excess)
         if self.clock is not None:
@@ -189,6 +196,9 @@ class AnchorRanging(Sensor):
             blocked[list(self.blocked)] = True
         obstructed = self.noise.obstructed(window, index, "anchor_ranging")
         ranges, lost = self.noise.sample(distance, link, "anchor_ranging", blocked, obstructed)
+        bias = self.noise.biases(window, index, "anchor_ranging")
+        if bias is not None:
+            ranges = ranges.add_(bias)
         mask = window.alive[..., None, None].expand(ranges.shape)
         if window.to_anchors is not None:
             mask = mask & window.to_anchors(placed["anchors"])[:, None, :, None]

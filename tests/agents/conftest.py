@@ -70,6 +70,8 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "default": indoor(),
     "nlos": indoor(nlos=0.3),
     "few": indoor(landmarks=4),
+    "late": indoor(landmarks=4, message_delay=1),
+    "biased": indoor(landmarks=4, anchors=2, range_bias_std=0.2),
     "uniform": indoor(prior="uniform"),
     "imu_bias": indoor(imu_bias=True),
     "anchors": indoor(imu=False, landmarks=0, anchors=8),
@@ -98,8 +100,14 @@ VARIANTS = (
     f"ekf:robust={ALL}:fusion=ci",
     f"ekf_joint:robust={ALL}",
     "ekf:fusion=ci",
+    "ekf:fusion=pairwise",
+    f"ekf:robust={ALL}:fusion=pairwise",
+    "ekf:fusion=exchange",
     "ekf_joint:robust=huber",
     "pf500:perturb=fixed:tempering=false",
+    "apf:variant=paper",
+    "pfnn:variant=paper",
+    "dfgo:exchange=all",
 )
 REFUSED = {("ekf_joint", "slots")}
 # Families where a localizer's own code meets something new. Those that only extend another (pfnn
@@ -113,6 +121,8 @@ CHOSEN = {
     **dict.fromkeys(("pfnn", "pf_trust"), ("default", "plane")),
     "mappo": ("default", "slots", "plane"),
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
+    "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
+    "dfgo_central": ("default", "imu_bias", "plane"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
@@ -128,13 +138,16 @@ CHOSEN = {
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
 SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
-SPECIAL = (*SPECIAL, "sight", "sight_few", "sight_uniform", "sight_bias")
+SPECIAL = (*SPECIAL, "late", "biased", "sight", "sight_few", "sight_uniform", "sight_bias")
 ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE)),
     *((n, "default") for n in VARIANTS),
-    *((n, "plane") for n in VARIANTS if ALL in n or "ci" in n or "perturb" in n),
+    *((n, "plane") for n in VARIANTS if ALL in n or "fusion" in n or "perturb" in n),
+    *((f"ekf:fusion={f}", "tags") for f in ("ci", "pairwise", "exchange")),
+    *((f"ekf:fusion={f}", "late") for f in ("ci", "pairwise", "exchange")),
     *((n, "wsn") for n in ("pf", "ekf")),
+    *((n, "biased") for n in ("ekf", "ekf_joint", "ekf:fusion=pairwise")),
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
@@ -178,6 +191,8 @@ def build(name: str, scenario: Scenario) -> Localizer:
     few: dict[str, Any] = {"particles": PARTICLES} if "particles" in known else {}
     if "bounds" in known and known["bounds"].default is not None:
         few["bounds"] = (PARTICLES - 10, PARTICLES + 20)
+    if name.startswith("dfgo"):
+        few["window"] = 3
     if "every" in known:
         few["every"] = 2
     if "weights" in known:

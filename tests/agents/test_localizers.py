@@ -103,7 +103,10 @@ def test_steps_do_not_touch_the_global_generator(sample: SimpleNamespace) -> Non
 
 def test_a_row_of_a_batch_is_its_own_run(case: SimpleNamespace, tools: SimpleNamespace) -> None:
     """Exactly, but for sums over the team: particles would multiply any rounding by thousands."""
-    tolerance = SUMMED if case.localizer.centralized else EXACT
+    summed = (
+        case.localizer.centralized or "fusion=exchange" in case.name
+    )  # everybody's joint filter
+    tolerance = SUMMED if summed else EXACT
     for row, seed in enumerate((3, 4)):
         alone = tools.play(case.localizer, case.scenario, [seed], 4)
         for one, many in zip(alone.estimates, case.run.estimates, strict=True):
@@ -158,6 +161,8 @@ def test_the_first_step_predicts_nothing(case: SimpleNamespace, tools: SimpleNam
 def test_without_measurements_the_first_estimate_is_the_prior(
     case: SimpleNamespace, tools: SimpleNamespace
 ) -> None:
+    if "variant=paper" in case.name:
+        pytest.skip("starts anywhere in the arena, whatever the prior")
     if isinstance(case.localizer, PolicyAgent):
         pytest.skip("what a policy says then is what it has learned")
     if isinstance(case.localizer, MinimumVarianceFir | Snapshot | RelativeTeam):

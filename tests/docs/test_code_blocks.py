@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ EXAMPLE = {
     "corridor-v0",
     "anchor_mean",
 }  # of tests/example_package: tests/test_plugins.py
+SHELL = ("<", ">", "|")  # what follows is the shell's, not the command's
 COMMAND: Any = typer.main.get_command(app)
 
 
@@ -87,8 +89,8 @@ def test_files_that_are_shown_exist(page: Path) -> None:
 @pytest.mark.parametrize(("page", "line"), lines())
 def test_command_lines_are_valid(page: str, line: str) -> None:
     """Parsed as the command parses them; what they name exists, with values that fit."""
-    _, *words = shlex.split(line, comments=True)
-    name, *rest = words
+    words = shlex.split(line, comments=True)
+    _, name, *rest = takewhile(lambda word: word not in SHELL, words)
     if name.startswith("-"):
         assert name in ("--help", "--version")
         return

@@ -2,6 +2,9 @@
 
 import ast
 import importlib
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ import torch
 
 import training.examples
 
+ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(Path(training.examples.__file__).parent.glob("[a-z]*.py"))
 
 
@@ -123,3 +127,19 @@ def test_localized_learns_on_estimates() -> None:
         first, last = (module.measured("navigation", p, estimates, 64) for p in (before, after))
     assert last["return"] > first["return"] + 0.2
     assert 0 < last["error"] < 3
+
+
+def test_benchmarl_runs_tasks_by_its_own_command(tmp_path: Path) -> None:
+    """MAPPO where actions are numbers, QMIX where they are choices and masked."""
+    example("benchmarl_tasks", "benchmarl", "hydra")
+    few = ["experiment.max_n_iters=2", "experiment.loggers=[]", "experiment.evaluation=false"]
+    for policy in ("on", "off"):
+        few.append(f"experiment.{policy}_policy_collected_frames_per_batch=400")
+        few.append(f"experiment.{policy}_policy_n_envs_per_worker=20")
+    for algorithm, task in (("mappo", "survey-v0"), ("qmix", "schedule-v0")):
+        line = [sys.executable, "-m", "training.examples.benchmarl_tasks", f"task=coloc/{task}"]
+        line += [f"algorithm={algorithm}", "task.options='horizon=20'", *few]
+        environ = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(line, cwd=tmp_path, env=environ, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert "mean return" in done.stderr

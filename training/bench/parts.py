@@ -56,8 +56,6 @@ _METHODS = {  # of a localizer and what it is made of
     "resampling.weigh": "weights",
     "resampling.resample_few": "resampling",
     "log_correction": "corrector network",
-    "screen.network.trust_vectors": "trust networks",
-    "screen.network.trust_ranges": "trust networks",
     "filter.screen.candidate.network.trust_vectors": "trust networks",
     "filter.screen.candidate.network.trust_ranges": "trust networks",
     "filter.resampling.weigh": "weights",

@@ -88,7 +88,7 @@ def _without_truth(recording: Recording, motion: str) -> Calibration:
 def calibrate_motion(recording: Recording, motion: str = "auto") -> MotionModel:
     """How the team moves by its truth: white acceleration, and the speed that is usual.
 
-    q = √(Var Δv / T) over T = 0.5 s. The usual speed, believed anew at each step, counts as often
+    q = √(Var Δv / T) over T = 0.5 s. The usual speed, believed again at each step, counts as often
     as it is believed: σ √(2 τ/dt), τ the time that a velocity lasts.
     """
     gained, speeds, lasting = [], [], []

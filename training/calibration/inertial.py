@@ -12,7 +12,7 @@ from coloc_env.datasets.noise_model import ImuBias, ImuModel
 from coloc_env.datasets.recording import Floats, Recording, Stamps, Table, Track
 from coloc_env.datasets.residuals import pose_at, turned
 
-_DT = 0.1  # s, of the steps whose noise is told
+_DT = 0.1  # s, of the steps whose noise is estimated
 _STILL = 2.0  # s: shorter than this nothing is learnt from standing
 _QUIET = (0.02, 0.15)  # rad/s, m/s²: a second with less spread than this is one of standing still
 _G = 9.80665

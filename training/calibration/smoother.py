@@ -289,7 +289,7 @@ def _driven(moved: Floats, model: NoiseModel, at: _Unknowns, robot: int, x: Floa
     knots = np.arange(at.knots - 1)
     step = moved[1:]
     wheels = model.odometry
-    slack = _DT * (0.1 / _DT) ** 0.5  # noise is told of steps of 0.1 s
+    slack = _DT * (0.1 / _DT) ** 0.5  # noise is that of steps of 0.1 s
     ahead = slack * (wheels.forward_std + wheels.relative * np.abs(step[:, 0]) / _DT) + 1e-4
     turn = slack * (wheels.turn_std + wheels.relative * np.abs(step[:, 2]) / _DT) + 1e-4
     angle = x[at.heading(robot, knots)]

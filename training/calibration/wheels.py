@@ -10,7 +10,7 @@ from coloc_env.datasets.noise_model import OdometryModel
 from coloc_env.datasets.recording import Floats, Recording, Table
 from coloc_env.datasets.residuals import pose_at
 
-_DT = 0.1  # s, of the steps whose noise is told
+_DT = 0.1  # s, of the steps whose noise is estimated
 _WINDOW = 10  # steps over which displacements are compared
 _DELAYS = np.arange(-0.5, 0.501, 0.05)  # s
 _CLIP = 4.0

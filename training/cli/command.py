@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from training.cli.bench import bench
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
+from training.cli.live import live
 from training.cli.recording import recording
 from training.cli.recordings import recordings
 from training.cli.render import render
@@ -73,6 +74,7 @@ for _command in (
     recordings,
     render,
     view,
+    live,
     bench,
     train,
     reproduce,

@@ -1,7 +1,9 @@
 """``coloc evaluate``."""
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,6 +74,10 @@ def evaluate(
     from training.evaluation.evaluate import evaluate as run
     from training.evaluation.evaluate import split_agents
 
+    if report:
+        from training.evaluation.report.page import plotly_script
+
+        plotly_script()  # what is not installed is said before anything runs
     names = split_agents(agents)
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
@@ -81,9 +87,9 @@ def evaluate(
             _show(found)
         files.write(found, folder)
         if report:
-            files.write_report(found, out.name, folder)
+            drawn = _drawn("report", partial(files.write_report, found, out.name, folder))
         if figures:
-            drawn = _draw(found, folder)
+            drawn = _drawn("figures", partial(files.write_figures, found, folder)) and drawn
     typer.echo(f"written to {out}")
     if found.errors or not drawn:
         raise typer.Exit(1)
@@ -116,17 +122,15 @@ def _show(found: "Evaluation") -> None:
         typer.echo(f"error: {name} has no results: {error}", err=True)
 
 
-def _draw(found: "Evaluation", folder: Path) -> bool:
-    """Whether the figures could be drawn; if not, say why."""
+def _drawn(what: str, draw: Callable[[], None]) -> bool:
+    """Whether something could be drawn; if not, say why."""
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend, say, is not here
-    from training.evaluation.files import write_figures
-
     try:
         with progress() as bars:
-            bars("figures", 0, 1)
-            write_figures(found, folder)
+            bars(what, 0, 1)
+            draw()
     except Exception as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        typer.echo(f"error: no figures could be drawn: {text}", err=True)
+        typer.echo(f"error: no {what} could be drawn: {text}", err=True)
         return False
     return True

@@ -59,6 +59,7 @@ def recordings(
     from training.threads import use_threads
 
     use_threads(threads)
+    from coloc_env.staging import staged_file
     from training.evaluation import recordings as all_of_them
     from training.evaluation.evaluate import split_agents
 
@@ -79,7 +80,8 @@ def recordings(
             )
             if out is not None:  # what is measured so far, should the rest be stopped
                 text = json.dumps(table, indent=1, ensure_ascii=False)
-                out.write_text(text + "\n", encoding="utf-8")
+                with staged_file(out) as file:
+                    file.write_text(text + "\n", encoding="utf-8")
     show(table["header"], table["rows"])
     if leave_one_out:
         chosen = all_of_them.chosen_elsewhere(figures, names)

@@ -60,7 +60,7 @@ def train(
 
     coloc train --config runs/corrector/run.json --set seed=1 --out runs/again
 
-    coloc train task-mappo --out runs/survey --set task=survey-v0
+    coloc train task-mappo --out runs/survey --set task=survey-v0:reward=sigma
 
     coloc evaluate indoor-v0 --agents apf,pfnn:weights=runs/corrector/pfnn.safetensors --out results
 

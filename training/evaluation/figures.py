@@ -149,10 +149,9 @@ def consistency(results: Evaluation) -> Figure:
     time = _time(results)
     for name, style in _line_styles(results).items():
         style["linewidth"] *= 0.6
-        axes.plot(time, _mean_per_step(results.agents[name].nees, results.worlds.scored), **style)
-    counts = results.worlds.scored.sum((0, 2)).tolist()
-    bands = {n: metrics.nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts)}
-    low, high = np.array([bands[n] for n in counts]).T
+        nees = results.agents[name].nees
+        axes.plot(time, metrics.mean_per_step(nees, results.worlds.scored), **style)
+    low, high = metrics.nees_bands(dim, results.worlds.scored)
     axes.fill_between(time, low, high, color=MUTED, alpha=0.25, linewidth=0, zorder=0)
     axes.axhline(dim, color=INK, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="NEES of the position", xlim=_span(time, results.dt))
@@ -287,14 +286,6 @@ def _quantiles_per_step(error: Floats, scored: Flags, shares: tuple[float, ...])
     some = ~np.isnan(kept).all(1)
     out[:, some] = np.nanquantile(kept[some], shares, axis=1)
     return out
-
-
-def _mean_per_step(values: Floats, scored: Flags) -> Floats:
-    """[K], of what is scored and not NaN."""
-    counts = scored & ~np.isnan(values)
-    total = np.where(counts, values, 0.0).sum((0, 2), dtype=np.float64)
-    number = counts.sum((0, 2))
-    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
 def _limit(set_limits: Callable[[float, float], object], truth: Floats) -> None:

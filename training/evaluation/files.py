@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from coloc_env.staging import staged_file
 from training.evaluation import runs
 from training.evaluation.results import Evaluation
 from training.evaluation.tables import csv_text, markdown
@@ -28,7 +29,9 @@ def write_report(results: Evaluation, name: str, folder: Path) -> None:
     """Write the page about the evaluation ``name``. ValueError where plotly is not installed."""
     from training.evaluation.report.page import page
 
-    (folder / REPORT).write_text(page([runs.of(results, name)]), encoding="utf-8")
+    text = page([runs.of(results, name)])
+    with staged_file(folder / REPORT) as file:
+        file.write_text(text, encoding="utf-8")
 
 
 def write_figures(results: Evaluation, folder: Path) -> None:

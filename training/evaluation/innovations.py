@@ -94,7 +94,7 @@ def innovations(
         observation = step.observation
         assert isinstance(localizer, GaussianFilter)
         assert before is not None
-        x, covariance = predict(localizer.process, before, observation)
+        x, covariance, _ = predict(localizer.process, before, observation)
         heard = received(believed, observation)
         for name, model in models.items():
             block = model.linearize(localizer.process, x, observation, heard)

@@ -38,6 +38,14 @@ def rmse_per_step(error: Floats, scored: Flags) -> Floats:
     return _root_mean(_squares(error, scored), scored, (0, 2))
 
 
+def mean_per_step(values: Floats, scored: Flags) -> Floats:
+    """[K], over runs and UAVs, of what is scored and not NaN."""
+    counts = scored & ~np.isnan(values)
+    total = np.where(counts, values, 0.0).sum((0, 2), dtype=np.float64)
+    number = counts.sum((0, 2))
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
 def rmse_per_track(error: Floats, scored: Flags) -> Floats:
     """[R, N], over steps: the absolute trajectory error of each UAV, without alignment."""
     return _root_mean(_squares(error, scored), scored, 1)
@@ -117,6 +125,14 @@ def nees_band(dim: int, count: int, level: float = 0.95) -> tuple[float, float]:
     tail = 0.5 * (1 - level)
     low, high = stats.chi2.ppf((tail, 1 - tail), dim * count) / count
     return float(low), float(high)
+
+
+def nees_bands(dim: int, scored: Flags) -> tuple[Floats, Floats]:
+    """Lower and upper end [K] of ``nees_band`` at each step; NaN where nothing is scored."""
+    counts = scored.sum((0, 2)).tolist()
+    bands = {n: nees_band(dim, n) if n else (np.nan, np.nan) for n in set(counts)}
+    low, high = np.array([bands[n] for n in counts]).T
+    return low, high
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,7 @@ def _recorded(
     series: dict[str, Tensor] = {}
     for step in rollout(localizer, scenario, seeds, stop=stop):
         k, world = step.k, step.world
-        links[k] = step.world.links[0]
+        links[k] = step.world.links(0)
         truth[:, k], attitude[k] = world.truth.position, world.truth.attitude[0]
         apart = step.action[..., :dim] - world.truth.position
         offset[:, k] = apart.to(torch.float32)

@@ -10,13 +10,12 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from agents.localizer import Estimate, Localizer
+from agents.localizer import Estimate, Localizer, finite_action
 from coloc_env.observation import Observation, prior_action
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
 
 NUMERICAL = (ArithmeticError, RuntimeError, np.linalg.LinAlgError)  # how a filter may break down
-_HUGE = 1e30  # m; what lies beyond counts as infinite
 
 
 class Breakdown(Exception):
@@ -84,12 +83,3 @@ def rollout(
         if k + 1 < horizon:
             world.advance(action)
             observation = world.observation()
-
-
-def finite_action(
-    estimate: Estimate, before: Float32[Tensor, "B N A"]
-) -> tuple[Float32[Tensor, "B N A"], Bool[Tensor, "B N"]]:
-    """The action, the one before where numbers are not finite, and where they are."""
-    action = estimate.action()
-    finite = (action.abs() < _HUGE).all(-1) & estimate.covariance.isfinite().all(-1).all(-1)
-    return torch.where(finite.unsqueeze(-1), action, before), finite

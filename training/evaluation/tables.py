@@ -19,6 +19,7 @@ COLUMNS = {
     "diverged_runs": "diverged",
     "nees": "NEES",
     "avg_particles": "particles",
+    "bytes_per_step": "bytes/step",
     "ms_per_step": "ms/step",
     "ratio_to_bound": "× bound",
 }
@@ -27,8 +28,8 @@ _EXPLAINED = """\
 Position errors in m, all agents on the same worlds; RMSE over UAVs, steps and runs, ± its
 standard deviation over runs; max is the mean over runs and UAVs of the largest error. A run counts
 as diverged if a UAV's error stays above {:g} m over its last {:g} s, or if an estimate was not
-finite; it stays in every figure. NEES: {} is consistent, more is overconfident. ms/step: the whole
-team, one world, one thread."""
+finite; it stays in every figure. NEES: {} is consistent, more is overconfident. bytes/step: what
+each UAV sends to others in a step. ms/step: the whole team, one world, one thread."""
 
 
 WITHOUT_TRUTH = (

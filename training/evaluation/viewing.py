@@ -18,9 +18,9 @@ from agents.localizer import Localizer
 from coloc_env.render.style import uav_colours
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import Ranging
+from training.evaluation.ellipsoids import half_axes, in_space
 from training.evaluation.metrics import Floats
 from training.evaluation.record import nees, places_of
-from training.evaluation.report.content import half_axes, in_space
 from training.evaluation.rollout import Step, rollout
 from training.evaluation.runs import Runs
 
@@ -148,7 +148,7 @@ def _log_step(view: Viewing, agent: str, step: Step, radius: float) -> None:
     view.estimates(
         agent, estimate.position.double().numpy(), estimate.covariance.numpy(), 0.8 * radius
     )
-    view.lines("world/links", _between(truth.numpy(), world.links[0].numpy()), _LINK)
+    view.lines("world/links", _between(truth.numpy(), world.links(0).numpy()), _LINK)
     _log_ranges(view, step)
     view.log("radio/bytes", view.rr.Scalars(float(world.bytes_sent[0].sum())))
     error, scored = world.score(step.action)

@@ -185,8 +185,8 @@ def _figures(loss: DetectorLoss, rows: TensorDict) -> dict[str, float | Tensor]:
 
 
 def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -> Mapping[str, Any]:
-    """Mean error (m) and resets a run of pf, hpff and nnhpff in the worlds of seeds 0 … runs − 1 of
-    the three cases."""
+    """Mean error (m) and resets a run of pf, hpff and nnhpff (without banks) in the worlds of seeds
+    0 … runs − 1 of the three cases."""
     found: dict[str, Any] = {}
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
@@ -194,7 +194,9 @@ def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -
         scenario = parse_scenario(f"{base}:case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
-            options = {"weights": "none"} if name == "nnhpff" else {}
+            options: dict[str, Any] = {} if name == "pf" else {"bank": False}
+            if name == "nnhpff":
+                options["weights"] = "none"
             one: Any = make(name, scenario, **options)
             if name == "nnhpff":
                 one.learn(detector)

@@ -123,6 +123,8 @@ def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -
     return {
         "state": before.state,
         "covariance": before.covariance,
+        "considered": before.considered,
+        "shared": before.shared,
         "step": before.step,
         "memory": before.memory,
         "variant": torch.full(before.batch_size[:1], variant),
@@ -130,7 +132,8 @@ def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -
 
 
 def _belief(entries: TensorDictBase) -> GaussianBelief:
-    parts = {name: entries[name] for name in ("state", "covariance", "step", "memory")}
+    names = ("state", "covariance", "considered", "shared", "step", "memory")
+    parts = {name: entries[name] for name in names}
     return GaussianBelief(**parts, batch_size=parts["step"].shape)
 
 

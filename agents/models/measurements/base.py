@@ -4,6 +4,7 @@ A ``Block`` holds m measurements of k numbers each, per UAV, masked; filters of 
 UAV, joint, iterated, robust) work on blocks alone and never on a sensor.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
@@ -93,6 +94,11 @@ class Block:
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
 
 
+def believed_biases(*std: float) -> tuple[float, ...]:
+    """Standard deviations of the biases of a link's numbers; none where all are 0."""
+    return std if any(std) else ()
+
+
 def noise_std(std: float) -> float:
     """The noise (m, rad) that a filter may assume: a sensor without any would leave no weights."""
     return max(std, _LEAST_STD)
@@ -101,11 +107,16 @@ def noise_std(std: float) -> float:
 class Measurement(ABC):
     """A sensor's model. ``cooperative`` ones involve other UAVs; ``mask_leaf`` names the leaf
     that marks which of its measurements are there (None: a single one, always). ``testable`` is
-    false for a belief that enters like a measurement, and says nothing of who predicts well."""
+    false for a belief that enters like a measurement, and says nothing of who predicts well.
+    ``depth``: how many measurements of one link a step can have. ``bias_std`` of each number that a
+    link measures (empty: none is believed to be biased), over ``bias_time`` s."""
 
     cooperative = False
     testable = True
     mask_leaf: str | None = None
+    depth = 1
+    bias_std: tuple[float, ...] = ()
+    bias_time = math.inf
 
     def count(self, observation: Observation) -> int:
         """How many measurements its block has."""

@@ -8,6 +8,7 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
 )
 from agents.models.process import Process
@@ -48,6 +49,7 @@ class LandmarkRangeBearings(Measurement):
     def __init__(self, sensor: LandmarkBearings) -> None:
         self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
         self.depth = sensor.depth
+        self.bias_std, self.bias_time = believed_biases(*sensor.bias_std), sensor.bias_time
 
     def read(
         self, observation: Observation
@@ -85,6 +87,7 @@ class UavRangeBearings(Measurement):
     def __init__(self, sensor: UavBearings) -> None:
         self.std = noise_std(sensor.range_std), noise_std(sensor.bearing_std)
         self.depth = sensor.depth
+        self.bias_std, self.bias_time = believed_biases(*sensor.bias_std), sensor.bias_time
 
     def read(
         self, observation: Observation

@@ -8,6 +8,7 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
 )
 from agents.models.process import Process
@@ -27,6 +28,7 @@ class _Ranges(Measurement):
     def __init__(self, noise: RangeNoise, tags: Tags) -> None:
         self.noise, self.variance = noise, noise_std(noise.std) ** 2
         self.tags = tags
+        self.bias_std, self.bias_time = believed_biases(noise.bias_std), noise.bias_time
 
     def read(
         self, observation: Observation

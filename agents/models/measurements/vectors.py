@@ -11,6 +11,7 @@ from agents.models.measurements.base import (
     Block,
     Measurement,
     Neighbours,
+    believed_biases,
     noise_std,
 )
 from agents.models.process import Process
@@ -125,6 +126,10 @@ class Heights(_Coordinates):
     """z of the position."""
 
     mask_leaf = "height_mask"
+
+    def __init__(self, sensor: Height) -> None:
+        super().__init__(sensor)
+        self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
 
     def components(self, dim: int) -> slice:
         return slice(2, 3)

@@ -92,6 +92,13 @@ def read_columns(path: Path, known: Mapping[str, Kind], unit: str) -> Columns:
         where = f"{path}, {found.word} {found.lines[row]}, column stamp"
         apart = (found.time[row - 1] - found.time[row]) * 1e-9
         raise DataError(f"{where}: the time is {apart:g} s before that of the row above")
+    check_numbers(found, known)
+    return found
+
+
+def check_numbers(found: Columns, known: Mapping[str, Kind]) -> None:
+    """Refuse numbers that nobody can have measured (DataError); what is measured and beyond all
+    measure becomes infinite."""
     for name, values in found.numbers.items():
         kind = known.get(name, "number")
         if kind == "number" and (bad := ~np.isfinite(values)).any():
@@ -100,7 +107,6 @@ def read_columns(path: Path, known: Mapping[str, Kind], unit: str) -> Columns:
             values[np.abs(values) > _MOST] = np.inf
         elif (bad := np.abs(values) > _MOST).any():
             found.fail(bad, name, f"is beyond {_MOST:g}")
-    return found
 
 
 # ------------------------------------------------------------------ text

@@ -18,7 +18,7 @@ ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 ACCELERATIONS = {"m/s2": 1.0, "g": 9.80665}
 KEYS = (
     "name", "dim", "robots", "frame", "units", "time", "map", "tags", "source", "licence", "origin",
-    "exchanges", "start", "dropped", "believed",
+    "exchanges", "start", "dropped", "believed", "streams",
 )  # fmt: skip
 
 
@@ -28,7 +28,8 @@ class Description:
 
     ``unit``: of stamps; ``epoch``: whether they count from 1970; ``zero``: ns since 1970 at their
     zero, if that is known. ``once``: each exchange of two robots stands in at least one file, and
-    both know of it; otherwise each robot knows what stands in its own.
+    both know of it; otherwise each robot knows what stands in its own. ``streams``: those that are
+    to come live (``OnlineLocalizer``); what a folder holds shows in the folder.
     """
 
     file: YamlFile
@@ -50,15 +51,16 @@ class Description:
     once: bool
     start: Floats
     dropped: dict[str, int]
+    streams: tuple[str, ...]
 
 
-def read_description(folder: Path) -> Description:
-    """Read and check a folder's ``recording.yaml``.
+def read_description(path: Path) -> Description:
+    """Read and check a ``recording.yaml``; its folder's name is the default of a recording's.
 
     Raises:
         DataError: the file is missing or damaged, or an entry is unknown, missing or no such thing.
     """
-    file = YamlFile(folder / FILE)
+    file, folder = YamlFile(path), path.parent
     file.allow((), KEYS)
     dim = file.whole("dim", default=0)
     if dim not in (2, 3):
@@ -104,6 +106,7 @@ def read_description(folder: Path) -> Description:
         once=file.choice(("exchanges",), ("once", "listed"), "once") == "once",
         start=_start(file, robots, dim, length, angle),
         dropped={key: file.whole("dropped", key, default=0) for key in file.mapping("dropped")},
+        streams=tuple(file.names("streams")),
     )
 
 

@@ -42,7 +42,7 @@ def read_recording(folder: str | os.PathLike[str]) -> Recording:
         raise DataError(f"{folder}: no such folder")
     if not (folder / FILE).is_file():
         raise DataError(f"{folder}: there is no {FILE}")
-    about = read_description(folder)
+    about = read_description(folder / FILE)
     _require_known(folder, about)
 
     def read(path: Path, known: Mapping[str, Kind]) -> Columns:
@@ -54,34 +54,42 @@ def read_recording(folder: str | os.PathLike[str]) -> Recording:
     truth = tuple(_track(folder / robot, about, read) for robot in about.robots)
     found, dropped = streams.read_streams(folder, about, read, _only)
     points = marked_points(_only(folder, POINTS, TABLES), about, read)
+    recording = replace(
+        described(about, found),
+        truth=truth,
+        dropped={
+            name: about.dropped.get(name, 0) + dropped.get(name, 0)
+            for name in (*about.dropped, *(key for key in dropped if key not in about.dropped))
+        },
+        points=points,
+    )
+    if not any(len(time) for time in _times(recording)):
+        raise DataError(f"{folder}: no file holds a sample")
+    return near_origin(_from_earliest(recording) if about.epoch else recording)
+
+
+def described(about: Description, found: Mapping[str, tuple[Table, ...]]) -> Recording:
+    """A recording without truth, of what its description says and some streams."""
     anchors, landmarks = (
         np.array(list(places.values())).reshape(-1, about.dim)
         for places in (about.anchors, about.landmarks)
     )
-    recording = Recording(
+    return Recording(
         name=about.name,
         dim=about.dim,
         robots=about.robots,
-        truth=truth,
+        truth=tuple(Track.unknown(about.dim) for _ in about.robots),
         streams=found,
         landmarks=world(landmarks, about.frame),
         anchors=world(anchors, about.frame),
         tags=streams.in_body(about.tags, about.frame),
         source=about.source,
         origin=about.origin,
-        dropped={
-            name: about.dropped.get(name, 0) + dropped.get(name, 0)
-            for name in (*about.dropped, *(key for key in dropped if key not in about.dropped))
-        },
         landmark_names=tuple(about.landmarks),
         anchor_names=tuple(about.anchors),
         epoch=about.zero,
-        points=points,
         start=streams.start_in_world(about),
     )
-    if not any(len(time) for time in _times(recording)):
-        raise DataError(f"{folder}: no file holds a sample")
-    return near_origin(_from_earliest(recording) if about.epoch else recording)
 
 
 def _track(home: Path, about: Description, read: Read) -> Track:

@@ -22,8 +22,8 @@ def nanoseconds(texts: Sequence[str], unit: str) -> Stamps:
     for i, text in enumerate(texts):
         whole, _, part = text.partition(".")
         try:
-            begun = text[-1:].isdigit() or text[:1].isdigit()
-            if len(part) > digits or not begun or "_" in text:
+            number = text[-1:].isdigit() or text[:1].isdigit()
+            if len(part) > digits or not number or "_" in text:
                 raise ValueError
             time = int(whole + part.ljust(digits, "0"))
         except ValueError:

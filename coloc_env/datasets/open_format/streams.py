@@ -268,9 +268,7 @@ def _known_to_both(tables: tuple[Table, ...]) -> tuple[Table, ...]:
         rows[robot].append((table.time, table.values))
         for other in np.unique(table.values[:, 1]).astype(int):
             there = table.values[:, 1] == other
-            own_tag, _, tag, distance = table.values[there].T
-            back = np.column_stack((tag, np.full(len(tag), float(robot)), own_tag, distance))
-            rows[other].append((table.time[there], back))
+            rows[other].append((table.time[there], seen_back(table.values[there], robot)))
     found = []
     for table, mine in zip(tables, rows, strict=True):
         time = np.concatenate([each for each, _ in mine])
@@ -283,6 +281,12 @@ def _known_to_both(tables: tuple[Table, ...]) -> tuple[Table, ...]:
             time, values = time[first], values[first]
         found.append(Table(time, values, table.columns))
     return tuple(found)
+
+
+def seen_back(values: Floats, robot: int) -> Floats:
+    """Rows of a robot's ``uav_ranges`` as the other end has them."""
+    own_tag, _, tag, distance = values.T
+    return np.column_stack((tag, np.full(len(tag), float(robot)), own_tag, distance))
 
 
 def _kinds(kind: Kind, *names: str) -> dict[str, Kind]:

@@ -57,6 +57,7 @@ def _description(recording: Recording) -> dict[str, Any]:
         "frame": "enu",
         "time": {"unit": "ns", "zero": recording.epoch or "relative"},
         "exchanges": "listed",
+        "streams": list(recording.streams),
     }
     places = {
         "landmarks": dict(zip(recording.landmark_names, recording.landmarks.tolist(), strict=True)),

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 from coloc_env.datasets import Recording, load
 from coloc_env.datasets.folders import Version, dataset_folder, version
 from coloc_env.datasets.grid import Grid
-from coloc_env.options import Group, PositiveSeconds, Seconds
+from coloc_env.options import Group, Metres, PositiveSeconds, Seconds
+from coloc_env.sensors import RangeNoise
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,22 @@ class ReplayOptions(RecordingOptions):
     """``dt``: duration of a step."""
 
     dt: PositiveSeconds = 0.1
+
+
+@dataclass(frozen=True)
+class BiasOptions(Group):
+    """The team believes that each link's ranges have a bias of ``range_bias_std`` m that lasts
+    ``range_bias_time`` s; what estimates claim of themselves considers that (0: no biases).
+    """
+
+    title: ClassVar[str] = "biases"
+
+    range_bias_std: Metres = 0.1
+    range_bias_time: PositiveSeconds = 100.0
+
+    def noise(self, std: float) -> RangeNoise:
+        """The believed noise of ranges, of standard deviation ``std`` m."""
+        return RangeNoise(std, bias_std=self.range_bias_std, bias_time=self.range_bias_time)
 
 
 @lru_cache(maxsize=4)

@@ -45,13 +45,13 @@ def anchor_scenario(
     grid: Grid,
     prior: Prior,
     process: Process,
-    range_std: float,
+    noise: RangeNoise,
     reward: Reward,
     odometry: Odometry | None = None,
 ) -> Scenario:
     """One tag with ranges to anchors, and with odometry if there is a belief about it."""
     places = tuple(map(tuple, recording.anchors.tolist()))
-    anchors = AnchorRanging(places, RangeNoise(std=range_std))
+    anchors = AnchorRanging(places, noise)
     sensors = [recorded_anchor_ranges(recording, grid, anchors)]
     believed: list[Sensor] = [anchors]
     if odometry is not None:

@@ -1,4 +1,4 @@
-"""Random numbers that last: redrawn now and then, and kept in between."""
+"""Random numbers that last: redrawn now and then and kept in between, or drifting."""
 
 import math
 
@@ -9,6 +9,7 @@ from torch import Tensor
 from coloc_env import noise
 
 _MEMORY = 10.0  # correlation times looked back
+_KNOTS = 64  # steps between the knots of a Gauss–Markov process
 
 
 def held_uniform(
@@ -59,3 +60,47 @@ def held_uniform(
         age = torch.where(renewed, 0, age + 1)
         held.append(torch.where(age <= back, value, very_first))
     return torch.stack(held, 1).unflatten(-1, links.shape)
+
+
+def gauss_markov(
+    rows: Int64[Tensor, "R"],
+    first: Int64[Tensor, "R"],
+    count: int,
+    links: Int64[Tensor, "*l"],
+    stream: str,
+    time: float,
+) -> Float32[Tensor, "R K *l"]:
+    """Standard normal numbers of numbered links, in ``count`` steps from each row's ``first`` on:
+    the stationary Gauss–Markov process x ← φ x + √(1 − φ²) e with φ = exp(−1/``time``).
+
+    A pure function of row, step (step 0 before it) and link: the process at every 64th step, which
+    is one of its kind itself, and between two such knots a path from the first that is bent to meet
+    the second (conditional simulation, Chilès & Delfiner, Geostatistics, 2012, section 7.3):
+    b_k = x_k + r_k (c′ − x_C), r_k = Cov(x_k, x_C) / Var(x_C) = φ^(C−k) (1 − φ^2k) / (1 − φ^2C).
+    """
+    numbers, phi, size = links.flatten(), math.exp(-1 / time), _KNOTS
+    start = first.clamp_min(0).div(size, rounding_mode="floor")
+    blocks = (size + count - 2) // size + 1
+    keys = noise.fold(rows.unsqueeze(-1), numbers).unsqueeze(1)  # [R, 1, L]
+    every = torch.arange(int(start.max()) + blocks + 1, device=rows.device).unsqueeze(-1)
+    fresh = noise.normal(noise.fold(keys, every), f"{stream}.knot", 1)[..., 0]  # [R, M, L]
+    knots, kept = [fresh[:, 0]], phi**size
+    for drawn in fresh.unbind(1)[1:]:
+        knots.append(kept * knots[-1] + math.sqrt(1 - kept**2) * drawn)
+    knot = torch.stack(knots, 1)
+    which = start.unsqueeze(-1) + torch.arange(blocks, device=rows.device)  # [R, blocks]
+    row = torch.arange(len(rows), device=rows.device).unsqueeze(-1)
+    left, right = knot[row, which], knot[row, which + 1]
+    white = noise.normal(noise.fold(keys, which.unsqueeze(-1)), f"{stream}.path", size)
+    path = [left]
+    for drawn in white.unbind(-1):
+        path.append(phi * path[-1] + math.sqrt(1 - phi**2) * drawn)
+    short = right - path[-1]
+    back = math.expm1(-2 * size / time)
+    share = [phi ** (size - k) * math.expm1(-2 * k / time) / back for k in range(size)]  # r_k
+    short = right - path[-1]
+    bent = [x + r * short for x, r in zip(path[:-1], share, strict=True)]
+    whole = torch.stack(bent, 2).flatten(1, 2)  # [R, blocks · 64, L]
+    steps = first.unsqueeze(-1) + torch.arange(count, device=rows.device)
+    at = steps.clamp_min(0) - size * start.unsqueeze(-1)
+    return whole[row, at].unflatten(-1, links.shape)

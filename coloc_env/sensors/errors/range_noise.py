@@ -11,7 +11,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.options import Group, Metres, PositiveMetres, PositiveSeconds, Share
 from coloc_env.sensors.base import Window, require
-from coloc_env.sensors.errors.persistence import held_uniform
+from coloc_env.sensors.errors.persistence import gauss_markov, held_uniform
 
 NlosKind = Literal["exponential", "constant"]
 
@@ -30,7 +30,9 @@ class RangeNoise:
       bias is drawn for every step in any case;
     - ``impulse``: probability of a gross error, uniform within ±``impulse_size`` m;
     - ``dropout``: probability that no range arrives;
-    - ``per_metre``: what each metre of distance adds to ``std``, in m.
+    - ``per_metre``: what each metre of distance adds to ``std``, in m;
+    - ``bias_std``: standard deviation in m of each link's bias, a Gauss–Markov process whose
+      correlation falls by e in ``bias_time`` s.
     """
 
     std: float = 0.2
@@ -45,12 +47,16 @@ class RangeNoise:
     dropout: float = 0.0
     nlos_time: float | None = None
     per_metre: float = 0.0
+    bias_std: float = 0.0
+    bias_time: float = 100.0
 
     def __post_init__(self) -> None:
         for name in ("nlos", "tail", "impulse", "dropout"):
             require(0 <= getattr(self, name) <= 1, self, name, "a probability in [0, 1]")
-        for name in ("std", "nlos_bias", "tail_std", "uniform", "impulse_size", "per_metre"):
+        sizes = ("std", "nlos_bias", "tail_std", "uniform", "impulse_size", "per_metre", "bias_std")
+        for name in sizes:
             require(0 <= getattr(self, name) < math.inf, self, name, "a size in m ≥ 0")
+        require(0 < self.bias_time < math.inf, self, "bias_time", "a time in s > 0")
         kinds = get_args(NlosKind)
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
         lasting = self.nlos_time is None or 0 < self.nlos_time < math.inf
@@ -66,6 +72,18 @@ class RangeNoise:
         first, count = window.steps[:, 0] - latency, window.steps.shape[1]
         time = self.nlos_time / window.layout.arena.dt
         return held_uniform(window.rows, first, count, links, f"{stream}.nlos", time) < self.nlos
+
+    def biases(
+        self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
+    ) -> Float32[Tensor, "R K *l"] | None:
+        """Biases (m) of the numbered links, ``latency`` steps before each of the window's; None
+        where there are none."""
+        if not self.bias_std:
+            return None
+        first, count = window.steps[:, 0] - latency, window.steps.shape[1]
+        time = self.bias_time / window.layout.arena.dt
+        drawn = gauss_markov(window.rows, first, count, links, f"{stream}.bias", time)
+        return self.bias_std * drawn
 
     def sample(
         self,
@@ -118,9 +136,10 @@ class RangeOptions(Group):
     ``nlos`` of them has a bias of ``nlos_bias`` m (``nlos_kind``: on average, or exactly), in each
     step by chance or over ``nlos_time`` s; a share ``uwb_tail`` has noise of ``uwb_tail_std`` m
     instead; ``uwb_uniform`` m is the half width of a uniform error; a share ``uwb_impulse`` is off
-    by up to ``uwb_impulse_size`` m, and a share ``uwb_dropout`` is missing. The team believes the
-    Gaussian part alone, with ``believed_uwb_std`` m for ``uwb_std`` (none: the true one, where the
-    scenario does not say otherwise).
+    by up to ``uwb_impulse_size`` m, and a share ``uwb_dropout`` is missing. Each link's ranges have
+    a bias of ``range_bias_std`` m that lasts ``range_bias_time`` s (a Gauss–Markov process). The
+    team believes the Gaussian parts alone, with ``believed_uwb_std`` m for ``uwb_std`` (none: the
+    true one, where the scenario does not say otherwise).
     """
 
     title: ClassVar[str] = "UWB ranges"
@@ -137,6 +156,8 @@ class RangeOptions(Group):
     uwb_impulse: Share = 0.0
     uwb_impulse_size: Metres = 10.0
     uwb_dropout: Share = 0.0
+    range_bias_std: Metres = 0.0
+    range_bias_time: PositiveSeconds = 100.0
     believed_uwb_std: PositiveMetres | None = None
 
     @property
@@ -155,10 +176,17 @@ class RangeOptions(Group):
             impulse=self.uwb_impulse,
             impulse_size=self.uwb_impulse_size,
             dropout=self.uwb_dropout,
+            bias_std=self.range_bias_std,
+            bias_time=self.range_bias_time,
         )
 
     @property
     def believed(self) -> RangeNoise:
         """The noise that the team believes in."""
         std = self.uwb_std if self.believed_uwb_std is None else self.believed_uwb_std
-        return RangeNoise(std, per_metre=self.uwb_std_per_metre)
+        return RangeNoise(
+            std,
+            per_metre=self.uwb_std_per_metre,
+            bias_std=self.range_bias_std,
+            bias_time=self.range_bias_time,
+        )

@@ -109,7 +109,7 @@ def test_evidence_is_that_of_both_predictions(tools: SimpleNamespace) -> None:
     for before, after, seen in zip(run.beliefs, run.beliefs[1:], run.observations, strict=False):
         scores = []
         for branch in (before.candidate, before.fallback):
-            x, covariance = predict(process, branch, seen)
+            x, covariance, _ = predict(process, branch, seen)
             near = received(scenario.believed, seen)
             blocks = [model.linearize(process, x, seen, near) for model in models]
             scores.append(predictive_score(blocks, covariance, 4.0))

@@ -160,13 +160,14 @@ def test_robust_weights_cost_little_without_trouble(robust: str, tools: SimpleNa
 def test_intersection_stays_honest_without_landmarks(tools: SimpleNamespace) -> None:
     """Ten seconds on ranges alone: what goes round in messages is the same news again and again."""
     scenario = make_scenario("indoor-v0", range_only=(2.0, 12.0))
-    naive, ci, joint = (
-        tools.score(name, scenario, 4, 120) for name in ("ekf", "ekf:fusion=ci", "ekf_joint")
-    )
+    names = ("ekf", "ekf:fusion=ci", "ekf:fusion=pairwise", "ekf_joint")
+    naive, ci, pairwise, joint = (tools.score(name, scenario, 4, 120) for name in names)
     assert naive.nees.mean() > 20
     assert ci.nees.mean() < 4
+    assert pairwise.nees.mean() < 5
     assert joint.nees.mean() < 5
-    assert ci.rmse < 1.2 * naive.rmse
+    assert pairwise.rmse < 1.1 * naive.rmse
+    assert ci.rmse < 2.5 * naive.rmse
 
 
 FAR, OWN_STD, THEIR_STD, RANGE_STD = 1000.0, 2.0, 0.9, 0.2

@@ -64,6 +64,90 @@ def test_fixed_perturbation_keeps_its_uavs(tools: SimpleNamespace) -> None:
     assert found.rmse_per_run.max() < 0.15
 
 
+# ---------------------------------------------------------------- as printed
+
+
+def test_the_printed_filter_starts_anywhere() -> None:
+    scenario = make_scenario("indoor-v0")
+    belief, _ = first(make("pf800:variant=paper:particles=4000", scenario), scenario)
+    place = belief.particles[..., :3] / torch.tensor(ROOM)
+    counts = torch.stack([torch.histc(place[0, 0, :, axis], 10, 0, 1) for axis in range(3)])
+    assert (counts / 400 - 1).abs().max() < 0.25
+    assert (belief.last[..., :3] / torch.tensor(ROOM) - 0.5).abs().max() < 0.03  # not the prior's
+
+
+def test_the_printed_filter_depends_on_its_perturbation(tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0")
+    usual, wide = (
+        tools.score(f"pf500:variant=paper:perturb_std={std}", scenario, 3, 100) for std in (0.1, 1)
+    )
+    assert usual.rmse_per_run.max() < 0.3
+    assert wide.rmse_per_run.min() > 0.3
+    assert wide.rmse_per_run.max() < 0.8
+
+
+def algorithm_2(count: int, ess: float) -> int:
+    """Inside Algorithm 1's test, where its second branch cannot be."""
+    return min(count + 100, 800) if ess < 0.5 * count and ess < 0.3 * count else count
+
+
+def test_resampling_is_algorithm_2(tools: SimpleNamespace) -> None:
+    """Without perturbation: copies of live particles, new ones copies of resampled ones."""
+    scenario = make_scenario("indoor-v0")
+    localizer: Any = make("apf:variant=paper:perturb_std=1e-9", scenario)
+    belief, _ = first(localizer, scenario)
+    g = torch.Generator().manual_seed(1)
+    seen = []
+    for scale in (0.1, 1.0, 6.0):  # of log-weights: many, some and few effective particles
+        weights = belief.log_weights + scale * torch.randn(belief.log_weights.shape, generator=g)
+        resampling = localizer.resampling
+        weighed = resampling.weigh(belief.particles, weights, belief.count)
+        particles, after = resampling.next_particles(
+            belief.particles, weighed, belief.count, belief.key
+        )
+        for b, n in ((0, 0), (1, 3)):
+            ess, target = float(weighed.ess[b, n]), int(weighed.target[b, n])
+            assert target == algorithm_2(300, ess)
+            seen.append((target, ess < 150))
+            if ess < 150:
+                new, old = particles[b, n, :target, :3], belief.particles[b, n, :300, :3]
+                assert (new.unsqueeze(1) - old).norm(dim=-1).amin(-1).max() < 1e-4
+                kept = after[b, n, :target].exp()
+                torch.testing.assert_close(kept, torch.full_like(kept, 1 / target))
+            else:
+                assert torch.equal(particles[b, n, :300], belief.particles[b, n, :300])
+    assert {target for target, _ in seen} == {300, 400}
+    assert {few for _, few in seen} == {True, False}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("pf500:variant=paper:perturb=fixed", "variant=paper takes no perturb"),
+        ("apf:variant=paper:robust=huber", "variant=paper takes no perturb, renewal, proposal"),
+        ("pfnn:perturb_std=0.2", "with variant=paper only"),
+        ("pf_trust:variant=paper", "trusts all measurements alike"),
+    ],
+)
+def test_what_the_printed_filter_has_not_is_refused(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words) as error:
+        make(text, make_scenario("indoor-v0"))
+    assert "\n" not in str(error.value)
+
+
+def test_redraws_are_counted(tools: SimpleNamespace) -> None:
+    scenario = make_scenario("indoor-v0", false_matches=0.1)
+
+    def share(name: str) -> float:
+        localizer = make(name, scenario)
+        run = tools.play(localizer, scenario, [0, 1], 15)
+        return float(torch.stack([b.renewed.float() for b in run.beliefs[4:]]).mean())
+
+    assert share("pf500") > 0.5
+    assert share("pf500:renewal=none") == share("pf500:variant=paper") == 0.0
+    assert share("pf500:proposal=ekf") == 1.0
+
+
 # ---------------------------------------------------------------- the cloud
 
 

@@ -91,6 +91,7 @@ def belief(inputs: StepInput, step: int = 1) -> SwarmBelief:
         error_sums=inputs.error_model.sums.unsqueeze(1).expand(-1, shape[1], -1, -1),
         window=window.empty(inputs.prior, inputs.joint, 0),
         delays=inputs.delays,
+        considered=inputs.prior.unsqueeze(-1)[..., :0],
         batch_size=shape,
     )
 

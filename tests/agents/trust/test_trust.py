@@ -150,7 +150,7 @@ def test_scaling_a_world_changes_no_weight(tools: SimpleNamespace) -> None:
     run = tools.play(localizer, small, [0, 1], 12)
     process, models, screen = localizer.process, localizer.models, localizer.screen
     near = received(small.believed, run.observations[11])
-    x, covariance = predict(process, run.beliefs[11], run.observations[11])
+    x, covariance, _ = predict(process, run.beliefs[11], run.observations[11])
     blocks = [m.linearize(process, x, run.observations[11], near) for m in models]
     e = torch.ones(process.error_size, dtype=torch.float64)
     weights = []

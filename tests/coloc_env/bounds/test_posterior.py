@@ -763,7 +763,7 @@ def test_what_cannot_be_bounded_is_refused() -> None:
     class Unheard(Sensor):
         leaves = Height.leaves
         sample = Height.sample
-        std, dropout = 0.1, 0.0
+        std, dropout, bias_std = 0.1, 0.0, 0.0
 
     with pytest.raises(NotImplementedError, match="Unheard"):
         posterior_bound(scenario(Unheard()), 1, steps=1)

@@ -91,7 +91,7 @@ def spreads(task: Scenario) -> torch.Tensor:
 
 def test_a_sample_stands_for_so_long_and_the_mean_from_then_on() -> None:
     table = Table(np.array([0, 100, 1000]) * 10**6, np.array([[1.0], [3.0], [5.0]]), ("x",))
-    whole, missing = bridged(table, 0.2)
+    whole, missing = bridged(table, 0.2, table.values.mean(0))
     assert whole.time.tolist() == [0, 10**8, 3 * 10**8, 10**9]
     assert whole.values[:, 0].tolist() == [1, 3, 3, 5]  # the mean is 3
     assert missing.values[:, 0].tolist() == [0, 0, 1, 0]

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 
+from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import action_width
 from coloc_env.scenarios import SCENARIOS, make_scenario, parse_override
 from coloc_env.world import World
@@ -23,6 +24,8 @@ RANGES: dict[str, Any] = {
     "uwb_impulse": 0.5,
     "uwb_impulse_size": 99.0,
     "uwb_dropout": 0.5,
+    "range_bias_std": 0.5,
+    "range_bias_time": 3.0,
 }
 DELAYED = {**RANGES, "uwb_delay": 1}
 LANDMARKS: dict[str, Any] = {
@@ -40,9 +43,16 @@ NETWORK: dict[str, Any] = {
     "link_failure": 0.5,
     "message_loss": 0.5,
     "message_delay": 1,
+    "links": "broadcast",
+    "interference": 0.5,
 }
 TEAM: dict[str, Any] = {"n_uavs": 3, "failure_rate": 1.0, "reward": "squared"}
-CONTROL: dict[str, Any] = {"control": "velocity", "a_max": 2.0}
+CONTROL: dict[str, Any] = {
+    "control": "velocity",
+    "a_max": 2.0,
+    "j_max": 0.3,
+    "keep_apart": 9.0,
+}
 KIDNAPPING: dict[str, Any] = {"kidnap_at": 0.2, "kidnapped": (0,)}
 STEIN: dict[str, Any] = {
     "horizon": 17,
@@ -114,6 +124,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "n_uavs": 7,
         "nlos_kind": "exponential",
         "comm_radius": 2e3,
+        "keep_apart": 5e3,
     },
     "campus-v0": {
         "flight": "s1",
@@ -141,6 +152,7 @@ CHANGED: dict[str, dict[str, Any]] = {
 RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_bias": {"nlos": 0.5},
     "nlos_kind": {"nlos": 0.5},
+    "range_bias_time": {"range_bias_std": 1.0},
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
@@ -148,12 +160,16 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
 STEERED: dict[str, dict[str, Any]] = {
     "a_max": {"control": "acceleration"},
+    "j_max": {"control": "velocity"},
+    "keep_apart": {"control": "velocity"},
 }
+CALLED: dict[str, dict[str, Any]] = {"interference": {"links": "chosen", "n_uavs": 4}}
 UNIFORM: dict[str, dict[str, Any]] = {"max_speed": {"prior": "uniform"}}
 WITH: dict[str, dict[str, dict[str, Any]]] = {
     "indoor-v0": {
         **RANGES_WITH,
         **FAILING,
+        **CALLED,
         **UNIFORM,
         **STEERED,
         "v_max": {"control": "velocity"},
@@ -163,28 +179,41 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "gyro_bias": {"imu_bias": True},
     },
     "wsn-v0": {**RANGES_WITH, **FAILING, "kidnapped": {"kidnap_at": 0.2, "n_uavs": 2}},
-    "swarm-v0": {**RANGES_WITH, **FAILING, **UNIFORM, **STEERED},
+    "swarm-v0": {
+        **RANGES_WITH,
+        **FAILING,
+        **UNIFORM,
+        **STEERED,
+        "interference": CALLED["interference"] | {"comm_radius": 2e4},
+    },
     "campus-v0": {
         **RANGES_WITH,
         **FAILING,
+        **CALLED,
         **UNIFORM,
         "wall_loss": {"flight": "s3"},
         "wall_excess": {"flight": "s3", "wall_loss": 0.0},
     },
-    "stein2d-v0": FAILING,
-    "stein3d-v0": FAILING,
+    "stein2d-v0": FAILING | CALLED,
+    "stein3d-v0": FAILING | CALLED,
 }
 SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.3, "nlos": 0.4}}
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
 
 
 def told(family: str, **overrides: Any) -> tuple[Any, ...]:
-    """All that one world does in four steps, and what its team believes."""
+    """All that one world does in four steps, and what its team believes. UAVs that are steered are
+    all sent one way; where they choose whom to call, UAV 0 calls 1, and 2 calls 3."""
     scenario = make_scenario(family, **SMALL.get(family, {}) | overrides)
-    world = World(scenario)
+    world, n = World(scenario), scenario.arena.n_uavs
+    way = -torch.ones(1, n, scenario.arena.dim) if scenario.motion.steered else None
+    calls = torch.full((1, n), SILENT)
+    calls[0, :4:2] = torch.arange(1, n + 1)[: len(calls[0, :4:2]) * 2 : 2]
+    called = None if scenario.network.links == "all" else calls
     seen, brought = world.reset(0), []
     for _ in range(4):
-        step = world.step(torch.ones(1, scenario.arena.n_uavs, action_width(scenario)))
+        estimates = torch.ones(1, n, action_width(scenario))
+        step = world.step(estimates, Commands(way, called))
         brought.append(
             {k: v.tolist() for k, v in seen.leaves.items()} | {"r": step.reward.tolist()}
         )

@@ -138,6 +138,25 @@ def test_an_interruption_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_report_that_cannot_be_written_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("training.evaluation.report.page.page", full)
+    done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-bound", "--report")
+    assert done.exit_code == 1
+    assert "no report could be drawn: [Errno 28] No space left on device" in done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(WRITTEN)
+
+
+def test_a_report_is_written_beside_the_results(tmp_path: Path) -> None:
+    done = evaluate(tmp_path / "out", "--agents", "test_still", "--no-figures", "--report")
+    assert done.exit_code == 0, done.output
+    assert "test_still" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

@@ -28,6 +28,7 @@ FIGURES = [
     "diverged_runs",
     "nees",
     "avg_particles",
+    "bytes_per_step",
     "ms_per_step",
     "ratio_to_bound",
     "diagnostics",
@@ -63,7 +64,12 @@ def test_schema(results: Evaluation) -> None:
         assert len(figures["per_uav_rmse"]) == 3
         for value in (*figures["diagnostics"].values(), *figures["per_uav_rmse"]):
             assert isinstance(value, int | float)
-        for key in set(FIGURES) - {"diagnostics", "per_uav_rmse", "avg_particles"}:
+        for key in set(FIGURES) - {
+            "diagnostics",
+            "per_uav_rmse",
+            "avg_particles",
+            "bytes_per_step",
+        }:
             assert isinstance(figures[key], int | float), key
         assert isinstance(figures["diverged_runs"], int)
 

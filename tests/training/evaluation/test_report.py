@@ -11,8 +11,9 @@ import pytest
 
 from coloc_env import make_scenario
 from training.evaluation import runs
+from training.evaluation.ellipsoids import half_axes
 from training.evaluation.evaluate import evaluate
-from training.evaluation.report.content import command, content, half_axes, worst
+from training.evaluation.report.content import command, content, worst
 from training.evaluation.report.page import page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -143,7 +143,7 @@ def test_only_what_is_measured_and_scored_becomes_a_sample(episode: SimpleNamesp
 
 def test_samples_are_what_the_detector_sees_online(episode: SimpleNamespace) -> None:
     """The same worlds by a hybrid filter that never resets."""
-    one = make("nnhpff:weights=none:threshold=1:main=pf@particles=100", episode.scenario)
+    one = make("nnhpff:bank=false:weights=none:threshold=1:main=pf@particles=100", episode.scenario)
     seen: list[Tensor] = []
 
     def watch(before: Any, after: Any, tensordict: Any) -> dict[str, Tensor]:

@@ -143,13 +143,13 @@ def test_every_epoch_flies_worlds_of_its_own_to_their_horizon() -> None:
     _, trainer = build()
     trainer.logger = Silence()
     worlds: Any = trainer.env.venv
-    reset, seen = worlds.world.reset, []
+    restart, seen = worlds.world.restart, []
 
     def noted(seeds: Any, rows: Any = None) -> Any:
         seen.append(seeds)
-        return reset(seeds, rows)
+        return restart(seeds, rows)
 
-    worlds.world.reset = noted
+    worlds.world.restart = noted
     frames = []
     trainer.on_epoch_end = lambda epochs: frames.append((epochs, trainer.collected_frames))
     trainer.train()

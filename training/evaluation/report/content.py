@@ -8,6 +8,7 @@ import numpy as np
 
 from coloc_env.render.style import UAV_COLOURS
 from training.evaluation import metrics
+from training.evaluation.ellipsoids import half_axes, in_space
 from training.evaluation.metrics import Floats
 from training.evaluation.runs import Method, Runs
 from training.evaluation.tables import COLUMNS, typed
@@ -47,9 +48,7 @@ def _run(runs: Runs) -> dict[str, Any]:
     scored = runs.scored
     thin = max(1, -(-steps // _POINTS))
     time = np.arange(steps) * runs.dt
-    counts = scored.sum((0, 2))
-    bands = {c: metrics.nees_band(dim, c) if c else (np.nan, np.nan) for c in set(counts.tolist())}
-    low, high = np.array([bands[c] for c in counts.tolist()]).T
+    low, high = metrics.nees_bands(dim, scored)
     return {
         "name": runs.name,
         "command": command(runs),
@@ -104,13 +103,10 @@ def _curves(runs: Runs, one: Method, thin: int) -> dict[str, Any]:
         metrics.rmse_per_step(one.error[..., i : i + 1], runs.scored[..., i : i + 1])[::thin]
         for i in range(n)
     ]
-    kept = np.where(runs.scored & np.isfinite(one.nees), one.nees, 0.0)
-    count = (runs.scored & np.isfinite(one.nees)).sum((0, 2))
-    mean = np.where(count > 0, kept.sum((0, 2)) / np.maximum(count, 1), np.nan)
     return {
         "error": _numbers(metrics.rmse_per_step(one.error, runs.scored)[::thin]),
         "uav_error": [_numbers(values) for values in of_uav],
-        "nees": _numbers(mean[::thin]),
+        "nees": _numbers(metrics.mean_per_step(one.nees, runs.scored)[::thin]),
         "share": _numbers(100 * share),
         "quantile": _numbers(quantiles),
     }
@@ -165,25 +161,6 @@ def _player(runs: Runs) -> dict[str, Any]:
         "high": [*runs.high, 0.0][:3],
         "places": {name: _numbers_of(in_space(values)) for name, values in runs.places.items()},
     }
-
-
-def half_axes(covariance: Floats) -> Floats:
-    """Half axes of the ellipsoids that hold 95 % of a Gaussian, as columns [..., 3, 3] (m)."""
-    dim = covariance.shape[-1]
-    known = np.isfinite(covariance).all((-2, -1), keepdims=True)
-    values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0).astype(np.float64))
-    radius = {2: 5.991, 3: 7.815}[dim] ** 0.5  # of the χ² distribution, 95 %
-    axes = radius * vectors * np.sqrt(values.clip(0.0))[..., None, :]
-    out = np.zeros((*covariance.shape[:-2], 3, 3))
-    out[..., :dim, :dim] = np.where(known, axes, np.nan)
-    return out
-
-
-def in_space(places: Floats) -> Floats:
-    """Positions with z = 0 in the plane."""
-    if places.shape[-1] == 3:
-        return places
-    return np.concatenate((places, np.zeros((*places.shape[:-1], 1), places.dtype)), -1)
 
 
 def _packed(values: Floats) -> str:

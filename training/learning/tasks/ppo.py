@@ -22,7 +22,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.trainers import ReplayBufferTrainer
 
-from agents.policies.decisions import outputs_of, relations_width, require_decisions
+from agents.policies.decisions import actor_for
 from agents.policies.moves import MOVES, table
 from agents.policies.task_actor import NETWORKS, TaskActor
 from agents.tasks import make_task
@@ -143,41 +143,37 @@ def _ppo(
     name: str,
     loss_class: type[MAPPOLoss],
     *,
-    task: str = "survey-v0",
+    task: str = "survey-v0:reward=sigma",
     network: Network = "feedforward",
     moves: Moves = "none",
     hold: PositiveCount = 1,
     difference: bool = False,
     hidden: Width = 64,
-    worlds: Worlds = 64,
-    epochs: Epochs = 60,
-    passes: PositiveCount = 4,
-    minibatches: PositiveCount = 4,
-    learning_rate: Factor = 1e-3,
+    worlds: Worlds = 128,
+    epochs: Epochs = 36,
+    passes: PositiveCount = 8,
+    minibatches: PositiveCount = 8,
+    learning_rate: Factor = 1.5e-3,
     gamma: Share = 0.97,
     gae_lambda: Share = 0.95,
     clip: Factor = 0.2,
     entropy: Share = 0.003,
     last_entropy: Share = 0.0,
+    draw: bool = False,
     seed: Seed = 0,
     score_worlds: ScoreWorlds = 256,
 ) -> Training:
     made = make_task(task)
-    require_decisions(made, network, moves, hold)
-    outputs, discrete = outputs_of(made, moves)
-    with drawn_from(seed):
-        actor = TaskActor(
-            task,
-            made.leaves["observation"].width,
-            outputs,
-            discrete,
-            network,
-            hidden,
-            moves,
-            hold,
-            relations_width(made, network),
-            sampled=made.sampled,
-        )
+    actor = actor_for(
+        task,
+        made,
+        seed,
+        network=network,
+        moves=moves,
+        hold=hold,
+        hidden=hidden,
+        sampled=draw or made.sampled,
+    )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
@@ -220,14 +216,15 @@ def _ppo(
             group["lr"] = learning_rate * left
         if entropy > 0:
             loss.entropy_coeff.fill_(last_entropy + (entropy - last_entropy) * left)
-        reader.carried = None
-        return Collector(
+        collecting = Collector(
             worlds_of(epoch),
             player,
             frames_per_batch=worlds * decisions,
             total_frames=worlds * decisions,
             auto_register_policy_transforms=False,
         )
+        reader.carried = None  # the Collector has tried the policy once
+        return collecting
 
     collector = EpochCollector(collect, epochs)
     whole = network == "recurrent"  # episodes are kept whole, in order
@@ -243,6 +240,8 @@ def _ppo(
         if collector.epoch == 0:
             critic.fit(rewards, gamma)
         rewards.div_(critic.unit)
+        # The horizon is what ends an episode, and its return: nothing comes after it.
+        batch["next", "terminated"] = batch["next", "done"]
         with torch.no_grad():
             loss.value_estimator(batch)  # advantages, of steps in order: before any shuffling
         kept = batch.select(*_KEPT, strict=False)
@@ -271,8 +270,10 @@ def task_mappo(**options: Any) -> Training:
     recurrent, graph attention over neighbours, or one that scores each candidate exchange.
     ``moves``: choices in place of velocities; ``hold``: for how many steps each decision is held.
     ``difference``: each call is rewarded by what it was worth to the team; the task's own option
-    ``reward=sigma`` rewards the filter's σ in place of the true error. Learning rate and entropy
-    bonus fall linearly. At the end the policy meets ``score_worlds`` of the protocol's worlds.
+    ``reward=sigma`` rewards the filter's σ in place of the true error. ``draw``: the policy goes on
+    drawing its actions when training is over, as it does anyway where a channel is shared. Learning
+    rate and entropy bonus fall linearly. At the end the policy meets ``score_worlds`` of the
+    protocol's worlds.
     """
     return _ppo("task-mappo", MAPPOLoss, **options)
 

@@ -17,8 +17,7 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.multiagent import QMixerLoss
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook
 
-from agents.policies.decisions import outputs_of, relations_width, require_decisions
-from agents.policies.task_actor import TaskActor
+from agents.policies.decisions import actor_for
 from agents.tasks import make_task
 from agents.weights import drawn_from
 from coloc_env.options import Factor, OpenShare, PositiveCount, Share
@@ -81,25 +80,11 @@ def task_qmix(
     between copies into the target network. Other options as ``coloc train task-mappo`` has them.
     """
     made = make_task(task)
-    require_decisions(made, network, moves, hold)
-    outputs, discrete = outputs_of(made, moves)
-    if not discrete:
+    actor = actor_for(task, made, seed, network=network, moves=moves, hold=hold, hidden=hidden)
+    if not actor.discrete:
         raise ValueError(f"task-qmix: {made.name} has no choices; moves=headings makes some")
     if network == "recurrent":
         raise ValueError("task-qmix: network=recurrent is not allowed: it learns from single steps")
-    with drawn_from(seed):
-        actor = TaskActor(
-            task,
-            made.leaves["observation"].width,
-            outputs,
-            discrete,
-            network,
-            hidden,
-            moves,
-            hold,
-            relations_width(made, network),
-            sampled=False,
-        )
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
@@ -125,7 +110,7 @@ def task_qmix(
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
     explore = EGreedyModule(
-        Categorical(outputs, (worlds, made.n_agents)),
+        Categorical(actor.architecture["outputs"], (worlds, made.n_agents)),
         eps_init=1.0,
         eps_end=0.0,
         action_key=_DECIDED,

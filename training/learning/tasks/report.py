@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.tasks import make_task
+from agents.tasks import TASKS, make_task
 from training.evaluation.score import FIRST_SEED, WORLDS
 from training.evaluation.tables import typed
 from training.learning import curves
@@ -133,13 +133,15 @@ def picture(found: Sequence[Recipe], known: Mapping[str, tuple[str, float]]) -> 
     return figure
 
 
-def heuristics(file: Path) -> dict[str, tuple[str, float]]:
-    """The best heuristic of each task and its return, from the protocol's table."""
-    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
-    found = {}
-    for task, policy, value, *_ in rows:
-        number = float(value.split("±")[0].replace("−", "-"))
-        found[task.strip("`")] = (policy.strip("`"), number)
+def heuristics(folder: Path) -> dict[str, tuple[str, float]]:
+    """The best heuristic of each task and its return, from the stored scores of the protocol."""
+    found: dict[str, tuple[str, float]] = {}
+    for name in TASKS:
+        factory: Any = TASKS[name]
+        file = folder / name / f"{factory.best}.json"
+        if file.exists():
+            score = json.loads(file.read_text(encoding="utf-8"))
+            found[name] = (factory.best, score["return"])
     return found
 
 
@@ -162,7 +164,7 @@ def main() -> None:
     ]
     (chosen.out.parent / "assets").mkdir(exist_ok=True)
     (chosen.out.parent / "assets" / f"{NAME}.json").write_text(json.dumps(each) + "\n")
-    known = heuristics(measured / "tasks_protocol.json")
+    known = heuristics(chosen.out / "scores")
     picture(found, known).savefig(chosen.out.parent / "assets" / f"{NAME}.png", dpi=110)
 
 

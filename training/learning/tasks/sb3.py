@@ -9,10 +9,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.policies.decisions import outputs_of
+from agents.policies.decisions import actor_for
 from agents.policies.task_actor import TaskActor
 from agents.tasks import make_task
-from agents.weights import untrained
 from coloc_env.envs.sb3 import CoLocVecEnv
 from coloc_env.options import Factor, PositiveCount, Share
 from training.learning.collectors import Epochs, Seed, Width, Worlds, world_seed
@@ -57,11 +56,11 @@ def task_sb3_ppo(
     *,
     task: str = "survey-v0",
     hidden: Width = 64,
-    worlds: Worlds = 64,
-    epochs: Epochs = 60,
-    passes: PositiveCount = 4,
-    minibatches: PositiveCount = 4,
-    learning_rate: Factor = 1e-3,
+    worlds: Worlds = 128,
+    epochs: Epochs = 36,
+    passes: PositiveCount = 8,
+    minibatches: PositiveCount = 8,
+    learning_rate: Factor = 1.5e-3,
     gamma: Share = 0.97,
     gae_lambda: Share = 0.95,
     clip: Factor = 0.2,
@@ -75,18 +74,7 @@ def task_sb3_ppo(
     allowed simply fails. Options as ``coloc train task-ippo`` has them.
     """
     made = make_task(task)
-    outputs, discrete = outputs_of(made, "none")
-    actor = untrained(
-        TaskActor,
-        seed,
-        task=task,
-        observation=made.leaves["observation"].width,
-        outputs=outputs,
-        discrete=discrete,
-        hidden=hidden,
-        sampled=made.sampled,
-        squash="clip",
-    )
+    actor = actor_for(task, made, seed, hidden=hidden, sampled=made.sampled, squash="clip")
     worlds_env = CoLocVecEnv(made.scenario, worlds, action=made)
     env = VecNormalize(worlds_env, norm_obs=False, gamma=gamma)
     rows = worlds_env.num_envs * made.scenario.horizon
@@ -105,7 +93,7 @@ def task_sb3_ppo(
         device="cpu",
         policy_kwargs={
             "net_arch": [hidden, hidden],
-            **({} if discrete else {"log_std_init": float(np.log(0.6))}),
+            **({} if actor.discrete else {"log_std_init": float(np.log(0.6))}),
         },
     )
     trainer = Sb3Trainer(

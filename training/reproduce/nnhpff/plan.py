@@ -31,7 +31,7 @@ CASES = {
 }
 MEMORIES, QUANTILES = (2, 5, 10), (0.95, 0.99)
 KIDNAPPED_AT, INDOOR_KIDNAPPED_AT = 18.0, 30.0  # s
-_INDOOR = (("anchors", 4), ("horizon", 600))
+_INDOOR = (("anchors", 8), ("horizon", 600))  # four would lie in one plane through the room
 INDOOR_METHODS = ("pfnn", "hpff:bank=false:main=pfnn", "nnhpff:bank=false:main=pfnn")
 INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:bank=false:main=ekf")
 PATIENT = "patience=4"  # steps: longer than an outlier stays in the FIR filter's window

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.particle.printed import PERTURB_STD as DEFAULT_STD
 from coloc_env.motion import MOTIONS
 from training.evaluation import metrics
 from training.evaluation.evaluate import Progress
@@ -18,7 +19,13 @@ from training.reproduce.settings import Settings
 from training.reproduce.store import Arrays, Facts
 from training.reproduce.work import Cell, Kind, Piece, Variant
 
-TABLE_AGENTS = ("pf500", "pf800", "apf", "ekf", "pfnn")
+TABLE_AGENTS = ("pf500", "pf800", "apf", "ekf", "dfgo", "pfnn")
+PRINTED = {name: f"{name}:variant=paper" for name in ("pf500", "pf800", "apf", "pfnn")}
+PERTURB_STD = (0.03, 0.05, 0.1, 0.2, 0.3, 1.0, 1.2)  # m, of the position; the paper gives none
+SWEEP = {  # agents as printed with their perturbation; that of the default is as it comes
+    PRINTED["pfnn"] + ("" if std == DEFAULT_STD else f":perturb_std={std:g}"): std
+    for std in PERTURB_STD
+}
 ROBUST_AGENTS = (
     *("ekf", "ekf:robust=gate", "ekf:robust=huber", "ekf_joint", "pf500", "pf800", "apf", "pfnn"),
     *("ekf_trust", "pf_trust"),
@@ -26,6 +33,9 @@ ROBUST_AGENTS = (
 ABLATION = {  # agents of figure 2 with their ranges; the proposed range is ``pfnn`` as it comes
     "pfnn" if span == PROPOSED else f"pfnn:correction={span[0]:g},{span[1]:g}": span
     for span in RANGES
+}
+PRINTED_ABLATION = {  # the same of the filter as printed
+    agent.replace("pfnn", PRINTED["pfnn"], 1): span for agent, span in ABLATION.items()
 }
 DEFAULT, FIGURE_9 = "default", "figure 9"  # cells
 STEADY = 10.0  # s: from here on a filter has settled
@@ -35,6 +45,12 @@ ONLINE = Kind(
     f"{__name__}:load_online",
     ("training.learning.pfnn_online",),
 )
+ORACLE = Kind(
+    "oracle",
+    "training.reproduce.pfnn.oracle:compute",
+    "training.reproduce.pfnn.oracle:load",
+    ("training.reproduce.pfnn.oracle",),
+)
 _FULL = (
     *("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20"),
     *("few-nlos", "few-nlos-false", "hard", "away-nlos-false"),
@@ -43,11 +59,13 @@ _FULL = (
 
 def paper(settings: Settings) -> Iterator[Cell]:
     """The paper's experiment: tables over the runs, figure 9 over half as many more, the corrector
-    learning in flight, costs."""
+    learning in flight, and one that knows the truth, costs."""
     (default, *_), runs = variants(settings.steps), settings.runs
-    yield Cell(default, tuple(dict.fromkeys((*TABLE_AGENTS, *ABLATION))), runs)
+    agents = (*TABLE_AGENTS, *PRINTED.values(), *SWEEP, *ABLATION, *PRINTED_ABLATION)
+    yield Cell(default, tuple(dict.fromkeys(agents)), runs)
     yield Cell(default, TABLE_AGENTS, max(1, runs + runs // 2), key=FIGURE_9)
     yield Cell(default, ("pfnn",), runs, ONLINE)
+    yield Cell(default, ("pfnn", PRINTED["pfnn"]), runs, ORACLE)
     yield Cell(default, TABLE_AGENTS, 1, COST)
 
 
@@ -141,6 +159,12 @@ def particles(one: Runs) -> Floats:
     """[R]: mean count; NaN for what has no particles."""
     values = one.record.series.get("particles")
     return np.array([np.nan]) if values is None else metrics.mean_per_run(values, one.scored)
+
+
+def redrawn(one: Runs) -> float | None:
+    """Per cent of UAV-steps in which a cloud was redrawn from an EKF's posterior."""
+    values = one.record.series.get("renewed")
+    return None if values is None else 100 * metrics.mean(metrics.mean_per_run(values, one.scored))
 
 
 def steady(one: Runs) -> slice:

@@ -131,6 +131,21 @@ def test_a_world_is_acted_in_alike_whoever_shares_its_batch(kind: str) -> None:
         assert torch.equal(x.action[2], y.action[0])
 
 
+def test_nothing_comes_after_the_horizon() -> None:
+    """The value to learn of an episode's last step is its reward, in units of the first returns'
+    spread; that of others is what is left of the return, for λ = 1."""
+    name, _, options = KINDS["numbers"]
+    training: Any = TRAININGS[name](**options | {"gamma": 0.9, "gae_lambda": 1.0})
+    (batch,) = list(training.collector.make(0))
+    reward = batch["next", "uav", "reward"].clone()
+    training.trainer._process_batch_hook(batch)
+    unit = training.trainer.loss_module.critic_network_params["module", "unit"]
+    left = torch.zeros_like(reward[:, 0])
+    for t in reversed(range(reward.shape[1])):
+        left = reward[:, t] + 0.9 * left
+        torch.testing.assert_close(batch["uav", "value_target"][:, t], left / unit)
+
+
 def test_masked_choices_are_never_made() -> None:
     task = make_task("schedule-v0", horizon=10)
     actor = TRAININGS["task-ippo"](**KINDS["candidates"][2]).module
@@ -146,7 +161,7 @@ def test_scores_are_the_protocols(tmp_path: Path) -> None:
     name, _, options = KINDS["held"]
     weights = runs.start(name, options | {"score_worlds": 5}, tmp_path / "run", quiet)
     card = json.loads(weights.with_suffix(".json").read_text())
-    task = make_task(options["task"])
+    task = make_task(options["task"]).with_options(reward="true")
     total = torch.zeros(5)
     for step in rollout(task, load_policy(task, str(weights)), FIRST_SEED + torch.arange(5)):
         total += step.reward.mean(-1)
