@@ -74,7 +74,11 @@ class _Coordinates(Measurement):
     """Some components of position or velocity themselves, as one measurement."""
 
     def __init__(self, sensor: PositionFix | Height | SlowFlight) -> None:
-        self.variance = noise_std(sensor.std) ** 2
+        self.sensor = sensor
+
+    def variance(self, dim: int) -> float | list[float]:
+        """R of each component."""
+        return noise_std(self.sensor.std) ** 2
 
     @abstractmethod
     def components(self, dim: int) -> slice:
@@ -105,7 +109,7 @@ class _Coordinates(Measurement):
         return Block(
             residual=residual,
             jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
+            variance=x.new_tensor(self.variance(process.dim)).expand_as(residual),
             mask=mask,
         )
 
@@ -114,6 +118,13 @@ class PositionFixes(_Coordinates):
     """z = p + noise."""
 
     mask_leaf = "position_fix_mask"
+
+    def __init__(self, sensor: PositionFix) -> None:
+        super().__init__(sensor)
+        self.axis_std = sensor.axis_std
+
+    def variance(self, dim: int) -> list[float]:
+        return [noise_std(std) ** 2 for std in self.axis_std(dim)]
 
     def components(self, dim: int) -> slice:
         return slice(0, dim)
