@@ -18,13 +18,15 @@ class Height(Sensor):
     """Leaves ``height`` [1] and ``height_mask`` [1]: z in m with Gaussian noise ``std``.
 
     Each UAV's heights have a bias of standard deviation ``bias_std`` m, a Gauss–Markov process
-    whose correlation falls by e in ``bias_time`` s.
+    whose correlation falls by e in ``bias_time`` s; ``estimated``: filters that believe in it have
+    it as a state, and do not only consider it.
     """
 
     std: float = 0.1
     dropout: float = 0.0
     bias_std: float = 0.0
     bias_time: float = 100.0
+    estimated: bool = False
 
     def __post_init__(self) -> None:
         require(self.std >= 0, self, "std", "a standard deviation in m ≥ 0")
@@ -56,7 +58,7 @@ class Height(Sensor):
 class BarometerOptions(Group):
     """With ``barometer``, UAVs measure their height with noise of ``barometer_std`` m and a bias
     that drifts (a Gauss–Markov process of standard deviation ``barometer_drift`` m, whose
-    correlation falls by e in ``barometer_time`` s); a share ``barometer_dropout`` is missing."""
+    correlation falls by e in ``barometer_time`` s), which filters estimate; a share ``barometer_dropout`` is missing."""
 
     title: ClassVar[str] = "barometer"
 
@@ -70,5 +72,5 @@ class BarometerOptions(Group):
     def true(self) -> tuple[Height, ...]:
         """The sensor as it is; nothing without a barometer."""
         drift = (self.barometer_drift, self.barometer_time)
-        own = Height(self.barometer_std, self.barometer_dropout, *drift)
+        own = Height(self.barometer_std, self.barometer_dropout, *drift, estimated=True)
         return (own,) if self.barometer else ()

@@ -2,6 +2,7 @@
 slowness."""
 
 from abc import abstractmethod
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -134,13 +135,28 @@ class PositionFixes(_Coordinates):
 
 
 class Heights(_Coordinates):
-    """z of the position."""
+    """z of the position, and the bias where the motion model has it as a state."""
 
     mask_leaf = "height_mask"
 
     def __init__(self, sensor: Height) -> None:
         super().__init__(sensor)
-        self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
+        if not sensor.estimated:
+            self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        block = super().linearize(process, x, observation, neighbours, derivatives)
+        if not process.drift_size:
+            return block
+        block.jacobian[..., -1] = 1.0
+        return replace(block, residual=block.residual - x[..., -1:].unsqueeze(-2))
 
     def components(self, dim: int) -> slice:
         return slice(2, 3)
