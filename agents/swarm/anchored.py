@@ -27,7 +27,7 @@ from agents.swarm.considered import Moments, after_step
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import Links
 from agents.swarm.marginals import block_diagonal, range_update, with_marginals
-from agents.swarm.navigation import NavigationFilter
+from agents.swarm.navigation import NavigationFilter, all_have_fixes
 from agents.tensorclasses import build
 from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
@@ -82,7 +82,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         self.process = make_process(believed)
         self.navigation = NavigationFilter(believed, self.process)
         self.centres = Centres(believed, ranging)
-        self.fixed = believed.sensor(PositionFix)
+        self.fixed = None if all_have_fixes(believed) else believed.sensor(PositionFix)
         fixes = self.fixed or PositionFix(_SURVEYED)
         swarm = method(self._team(ranging, fixes))
         assert isinstance(swarm, SwarmFilter)
@@ -266,7 +266,7 @@ def is_plain(believed: Believed) -> bool:
     ranging = believed.sensor(Ranging)
     lever_arms = ranging is not None and ranging.tags
     kinds = (AnchorRanging, Height, OpticalFlow, SlowFlight, Tdoa)
-    others = any(believed.sensor(kind) for kind in kinds)
+    others = any(believed.sensor(kind) for kind in kinds) or all_have_fixes(believed)
     process = make_process(believed)
     return not (lever_arms or others or process.error_size > process.dim)
 

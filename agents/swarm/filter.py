@@ -44,7 +44,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
-    # Teams with anchors, heights, flow, time differences or slow flight are served through ``agents.swarm.anchored``.
+    # Teams with more than ranges between UAVs are served through ``agents.swarm.anchored``.
     serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight, OpticalFlow, Tdoa)
     window = 0  # past steps in the stress
     decay = 0.0  # λ of w(τ) = exp(−λ (t − τ)), 1/s

@@ -58,7 +58,8 @@ class Height(Sensor):
 class BarometerOptions(Group):
     """With ``barometer``, UAVs measure their height with noise of ``barometer_std`` m and a bias
     that drifts (a Gauss–Markov process of standard deviation ``barometer_drift`` m, whose
-    correlation falls by e in ``barometer_time`` s), which filters estimate; a share ``barometer_dropout`` is missing."""
+    correlation falls by e in ``barometer_time`` s), which filters estimate; a share
+    ``barometer_dropout`` is missing."""
 
     title: ClassVar[str] = "barometer"
 

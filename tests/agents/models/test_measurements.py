@@ -60,6 +60,7 @@ KINDS: dict[str, tuple[str, Sensor]] = {
     "landmark bearings": ("wheeled", LandmarkBearings(5, 1e-6, 1e-6, 20.0, 0.7, depth=2)),
     "uav bearings": ("wheeled", UavBearings(1e-6, 1e-6, 0.7, depth=2)),
     "height": ("velocity", Height(1e-6, dropout=0.2)),
+    "height, drift": ("velocity", Height(1e-6, bias_std=1e-6, estimated=True)),
     "slow flight": ("velocity", SlowFlight(0.5)),
     "fixes": ("inertial", PositionFix(1e-6, count=2)),
     "fixes, ins": ("ins", PositionFix(1e-6, count=2)),
