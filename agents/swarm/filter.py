@@ -21,7 +21,16 @@ from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Ins,
+    OpticalFlow,
+    PositionFix,
+    Ranging,
+    SlowFlight,
+    Tdoa,
+)
 
 _MIN_VARIANCE = 1e-6  # m² per axis: of a prior that is believed to be exact
 
@@ -34,8 +43,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
-    # Teams with anchors, heights or slow flight are served through ``agents.swarm.anchored``.
-    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight)
+    # Teams with more than ranges between UAVs are served through ``agents.swarm.anchored``.
+    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight, OpticalFlow, Tdoa)
     window = 0  # past steps in the stress
     decay = 0.0  # λ of w(τ) = exp(−λ (t − τ)), 1/s
     recursive = True  # the solution has dead reckoning as its prior

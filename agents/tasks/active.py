@@ -1,5 +1,5 @@
-"""``active-v0``: does moving well localize better? UAVs in a room with four anchors choose where they
-measure from."""
+"""``active-v0``: does moving well localize better? UAVs in a room with four anchors choose where
+they measure from."""
 
 from dataclasses import replace
 from itertools import product
@@ -21,7 +21,7 @@ from coloc_env.world import World
 _V_MAX, _A_MAX = 3.0, 1.5
 _CM = 100.0
 _AHEAD = 3.0  # s: how far the greedy rule looks
-_WAYS = torch.tensor([way for way in product((-1.0, 0.0, 1.0), repeat=3)])
+_WAYS = torch.tensor(list(product((-1.0, 0.0, 1.0), repeat=3)))
 
 
 def circle(seen: Seen) -> Tensor:
@@ -58,7 +58,8 @@ class Active(Task):
     """Six UAVs in the room of ``indoor-v0`` without landmarks, with an IMU each, ranges between
     them and to four anchors, and accelerations as actions.
 
-    Two steps a second. Reward of each: minus its own error, averaged over the episode, in cm, of errors up to 10 m.
+    Two steps a second. Reward of each: minus its own error, averaged over the episode, in cm, of
+    errors up to 10 m.
     """
 
     name = "active-v0"
