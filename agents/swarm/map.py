@@ -87,15 +87,14 @@ class RecursiveMap(JointGaussNewton):
         delays = None if self.clock is None else inputs.delays
         solution = Solution(inputs.prior, inputs.variance, inputs.joint, delays=delays)
         nothing = torch.zeros_like(inputs.pair_variance)
-        sites = Sites(nothing, nothing, nothing)
+        found = sites = Sites(nothing, nothing, nothing)
         for k in range(_FIRST_PASSES if first else _PASSES):
             assert solution.joint is not None
             known = inputs.delays if solution.delays is None else solution.delays
             variance = length_variance(solution.joint, known, solution.position)
             at = cavity(solution.residual(inputs), variance, sites)
-            sites = sites_by_moments(at, inputs, self.std, sites if k else None)
-            if adjust is not None:
-                sites = adjust(k, inputs, at, sites)
+            found = sites_by_moments(at, inputs, self.std, found if k else None)
+            sites = found if adjust is None else adjust(k, inputs, at, found)
             solution = self._by_sites(inputs, precision, solution.position, sites)
         return replace(solution, outlier=sites.outlier)
 
