@@ -76,9 +76,10 @@ def _deep(
     depth = max(there.shape[1] for _, there in team)
     values, masks = [], []
     for seen, there in team:
-        pad = ((0, 0), (0, depth - there.shape[1]), (0, 0))
-        values.append(np.pad(seen, (*pad, (0, 0))).reshape(grid.count, -1))
-        masks.append(np.pad(there, pad).reshape(grid.count, -1))
+        missing = (0, depth - there.shape[1])
+        none = (0, 0)
+        values.append(np.pad(seen, (none, missing, none, none)).reshape(grid.count, -1))
+        masks.append(np.pad(there, (none, missing, none)).reshape(grid.count, -1))
     deep = replace(sensor, depth=depth)
     leaves = {names[0]: as_series(values), names[1]: as_series(masks)}
     return RecordedSensor(deep, leaves), deep

@@ -23,7 +23,7 @@ def tags_of(found: Columns, about: Description, column: str) -> Floats:
 
 def differences(found: Columns, about: Description) -> Made:
     """``from, to, difference[, own_tag]``: how much farther ``to`` is than ``from``."""
-    ends = [indices(found, column, about.anchors) for column in ("from", "to")]
+    ends = [indices(found, column, tuple(about.anchors)) for column in ("from", "to")]
     if (same := ends[0] == ends[1]).any():
         found.fail(same, "to", "is from itself")
     difference = found.require("difference")[:, 0] * about.length
