@@ -47,13 +47,14 @@ class Step:
 
 @torch.no_grad()
 def rollout(
-    localizer: Localizer,
+    localizer: Localizer | None,
     scenario: Scenario,
     seeds: Int64[Tensor, "B"],
     steps: int | None = None,
     stop: int | None = None,
 ) -> Iterator[Step]:
     """A localizer's steps in the worlds of ``seeds``: ``steps`` of them (default: the horizon).
+    Without one nobody estimates, and the action is what the prior says.
 
     The world moves on when the next step is asked for. From step ``stop`` on the localizer is not
     asked any more, and its last action stands. Raises Breakdown for a numerical error.
@@ -66,7 +67,7 @@ def rollout(
     horizon = scenario.horizon if steps is None else steps
     for k in range(horizon):
         seconds = 0.0
-        if stop is None or k < stop:
+        if localizer is not None and (stop is None or k < stop):
             try:
                 belief = localizer.reset(observation) if k == 0 else belief
                 start = time.perf_counter()
