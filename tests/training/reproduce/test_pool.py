@@ -37,6 +37,7 @@ def test_one_process_does_the_same(tmp_path: Path) -> None:
 
 
 _PARENT = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
@@ -44,6 +45,7 @@ from units import Unit
 from training.reproduce import pool
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     units = [Unit(str(i), seconds=300.0) for i in range(4)]
     list(pool.work(units, Path(sys.argv[1]), 2, lambda size: None))
 """
@@ -71,8 +73,8 @@ def test_workers_end_with_their_parent(kill: signal.Signals, tmp_path: Path) -> 
         workers = [int(file.name.rsplit("-", 1)[1]) for file in out.glob("*.try-*")]
         assert all(map(_running, workers))
         parent.send_signal(kill)
-        parent.wait(20)
-        _wait_for(lambda: not any(map(_running, workers)), 10)
+        parent.wait(60)
+        _wait_for(lambda: not any(map(_running, workers)), 60)
     finally:
         parent.kill()
         parent.wait()
