@@ -199,6 +199,30 @@ def parse(owner: str, text: str, known: Mapping[str, Option]) -> tuple[str, Any]
     raise ValueError(_unfit(owner, known[key], value))
 
 
+def parse_all(
+    owner: str,
+    texts: Iterable[str],
+    known: Mapping[str, Option],
+    given: Mapping[str, Any] = types.MappingProxyType({}),
+) -> dict[str, Any]:
+    """Several ``key=value``, and what is ``given`` already. Raises ValueError, too, for an option
+    that is given twice."""
+    found = dict(given)
+    for text in texts:
+        key, value = parse(owner, text, known)
+        if key in found:
+            raise ValueError(f"{owner}: {key} is given twice")
+        found[key] = value
+    return found
+
+
+def typed(value: Any) -> str:
+    """A setting as it would be typed on a command line."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(typed, value))
+    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
+
+
 def require_known(what: str, wanted: Iterable[str] | None, known: Iterable[str]) -> None:
     """Raise ValueError for a wanted name that does not exist; None wants nothing in particular."""
     names = list(known)

@@ -11,12 +11,15 @@ import typer
 
 from training.cli.options import (
     Data,
+    Jobs,
+    Ray,
     ScenarioName,
     Seed,
     Settings,
     Threads,
     build_scenario,
     require_seed,
+    workers_of,
 )
 from training.cli.terminal import progress, show
 
@@ -48,6 +51,8 @@ def evaluate(
         bool, typer.Option("--bound/--no-bound", help="Compute the posterior bound.")
     ] = True,
     threads: Threads = 1,
+    jobs: Jobs = 1,
+    ray: Ray = None,
     data: Data = None,
 ) -> None:
     """Let agents meet the same worlds, and write how well each localizes.
@@ -63,6 +68,8 @@ def evaluate(
 
     coloc evaluate indoor-v0 --agents ekf,ekf:robust=huber --set nlos=0.3 --set landmarks=5
     --out results/hard
+
+    coloc evaluate indoor-v0 --agents ekf,pf500,apf --runs 1000 --ray auto --out results/many
 
     coloc evaluate replay-mrclam-v0 --agents dead_reckoning,ekf --data ~/recordings --out results/uw
     """
@@ -81,8 +88,8 @@ def evaluate(
     names = split_agents(agents)
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
-        with progress() as bars:
-            found = run(built, names, runs, seed, bars, bound=bound)
+        with workers_of(jobs, ray) as workers, progress() as bars:
+            found = run(built, names, runs, seed, bars, bound=bound, workers=workers)
         with suppress(OSError, SystemExit):  # where nobody reads it, the files are still written
             _show(found)
         files.write(found, folder)

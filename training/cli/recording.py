@@ -228,12 +228,12 @@ def calibrate(
     show(["", "samples", "bias", "σ", "beyond 3 σ", "σ if white"], lines)
     model, notes = learnt.model, learnt.notes
     if tune is not None:
-        from coloc_env.scenarios import parse_override
+        from coloc_env.scenarios import parse_overrides
         from training.calibration.tune import tuned
 
         if not found.tracked:
             raise ValueError("--tune needs ground truth")
-        chosen = dict(parse_override("replay-v0", text) for text in settings or ())
+        chosen = parse_overrides("replay-v0", settings or ())
         if span is not None:
             chosen.setdefault("span", _span(span))
         with progress() as bars:

@@ -48,9 +48,9 @@ def render(
     if not 1 <= steps <= built.horizon:
         raise ValueError(f"--steps {steps} is not allowed: 1 to {built.horizon} for {scenario}")
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend, say, is not here
+    from agents.registry import make
     from coloc_env.render import frame_to_png, save_animation
     from training.evaluation.animation import frames
-    from training.evaluation.evaluate import make
 
     every = steps if suffix == ".png" else -(-steps // _FRAMES)
     with staged_file(out) as file, progress() as bars:

@@ -7,7 +7,7 @@ import torch
 
 from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import action_width
-from coloc_env.scenarios import SCENARIOS, make_scenario, parse_override
+from coloc_env.scenarios import SCENARIOS, make_scenario, parse_overrides, parse_scenario
 from coloc_env.world import World
 
 RANGES: dict[str, Any] = {
@@ -239,7 +239,7 @@ SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
 
 
-def told(family: str, **overrides: Any) -> tuple[Any, ...]:
+def world_of(family: str, **overrides: Any) -> tuple[Any, ...]:
     """All that one world does in four steps, and what its team believes. UAVs that are steered are
     all sent one way; where they choose whom to call, UAV 0 calls 1, and 2 calls 3."""
     scenario = make_scenario(family, **SMALL.get(family, {}) | overrides)
@@ -259,6 +259,18 @@ def told(family: str, **overrides: Any) -> tuple[Any, ...]:
     return brought, scenario.horizon, scenario.believed, scenario.reference
 
 
+def test_an_override_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_overrides("indoor-v0", ["nlos=0.1", "horizon=9", "nlos=0.1"])
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_scenario("indoor-v0:nlos=0.1:nlos=0.2")
+
+
+def test_a_variants_overrides_go_first() -> None:
+    scenario = parse_scenario("indoor-v0:nlos=0.1:horizon=9", "nlos=0.2")
+    assert scenario.overrides == {"nlos": 0.2, "horizon": 9}
+
+
 @pytest.mark.parametrize("family", CHANGED)
 def test_every_override_is_tried(family: str) -> None:
     assert set(CHANGED[family]) == set(SCENARIOS.options_of(family))
@@ -267,11 +279,11 @@ def test_every_override_is_tried(family: str) -> None:
 @pytest.mark.parametrize(("family", "name"), EACH)
 def test_every_override_changes_something(family: str, name: str) -> None:
     others = WITH[family].get(name, {})
-    assert told(family, **others) != told(family, **others, **{name: CHANGED[family][name]})
+    assert world_of(family, **others) != world_of(family, **others, **{name: CHANGED[family][name]})
 
 
 @pytest.mark.parametrize(("family", "name"), EACH)
 def test_every_override_is_read_from_the_command_line(family: str, name: str) -> None:
     value = CHANGED[family][name]
     text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    assert parse_override(family, f"{name}={text}") == (name, value)
+    assert parse_overrides(family, [f"{name}={text}"]) == {name: value}
