@@ -26,8 +26,11 @@ def write_steps(plan: Plan, runs: TensorDictBase, path: Path) -> None:
     the columns of steps."""
     k, n = plan.steps, plan.scenario.arena.n_uavs
     step, uav = np.repeat(np.arange(k), n), np.tile(np.arange(n), k)
-    index = {"step": step.astype(np.int32), "uav": uav.astype(np.int16)}
-    index["time"] = step * plan.scenario.arena.dt
+    index: dict[str, np.ndarray] = {
+        "step": step.astype(np.int32),
+        "uav": uav.astype(np.int16),
+        "time": step * plan.scenario.arena.dt,
+    }
     _write([c for c in plan.columns if not c.world], runs, "steps", index, path)
 
 
