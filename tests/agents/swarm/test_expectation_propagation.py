@@ -114,9 +114,7 @@ def test_cavity_and_site_make_the_posterior(
     """N(cavity) times the site is the posterior that the cavity was taken from."""
     weight = min(weight, 0.9 / variance)
     nothing = scalar(0.0)
-    at = cavity(
-        scalar(residual), scalar(variance), Sites(scalar(weight), scalar(shift), nothing)
-    )
+    at = cavity(scalar(residual), scalar(variance), Sites(scalar(weight), scalar(shift), nothing))
     tau = 1 / float(at.variance)
     assert tau + weight == pytest.approx(1 / variance, rel=1e-9)
     # lengths are counted from the posterior's mean: the cavity's is r − r_c, the site's r − shift
