@@ -168,7 +168,7 @@ class LocalizerPolicy(TensorDictModuleBase):
         if gradients and not isinstance(network, nn.Module):
             raise ValueError(f"gradients=True: {localizer.name} has no network of its own")
         super().__init__()
-        self.network = network if gradients else None
+        self.network: nn.Module | None = network if gradients else None
         self.localizer = localizer
         self.scenario = scenario
         self.carry = carry

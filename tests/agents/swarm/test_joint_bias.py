@@ -10,6 +10,7 @@ from torch import Tensor
 
 from agents import make
 from agents.swarm import delays, ins_bias, joint, joint_bias
+from agents.swarm.belief import SwarmBelief
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import Ins
 from coloc_env.world import World
@@ -93,14 +94,14 @@ def test_a_fix_corrects_its_own_bias_as_a_kalman_filter_would() -> None:
     assert not known.known[..., D : 2 * D].any()  # a fixed position is independent of biases
 
 
-def covariance_of_all(belief: Tensor) -> Tensor:
+def covariance_of_all(belief: SwarmBelief) -> Tensor:
     """Of positions, delays and biases."""
     x = delays.joint_covariance(belief.joint, belief.delays)
     known, own = belief.joint_bias.known.flatten(1, 2), belief.joint_bias.own.flatten(1, 2)
     return torch.cat((torch.cat((x, known.mT), -1), torch.cat((known, own), -1)), -2)
 
 
-def test_the_covariance_of_all_stays_positive(tools: SimpleNamespace) -> None:
+def test_the_covariance_of_all_stays_positive() -> None:
     scenario = make_scenario("campus-v0", flight="s1")
     localizer, world = make("map", scenario), World(scenario, 1)
     observation = world.reset(torch.arange(1))
