@@ -136,9 +136,9 @@ def stdcl_factors(
     variants: str = "/".join(VARIANTS),
     start: str = "none",
     width: Annotated[int, Quantity("", 1, 1 << 10)] = 20,
-    worlds: Worlds = 6,
+    worlds: Worlds = 4,
     epochs: Epochs = 1,
-    steps: Steps = 6,
+    steps: Steps = 12,
     learning_rate: Factor = 3e-3,
     last_rate: Factor = 1e-4,
     seed: Seed = 0,
@@ -204,7 +204,7 @@ class Annealed(RoundRobin):
 def _scale(scenario: Scenario) -> float:
     """RMSE (m) of ``map``, after it has settled."""
     scenario = replace(scenario, horizon=min(scenario.horizon, _SCALE_STEPS))
-    result = record(make(_BASE, scenario), scenario, _SCALE_SEED + torch.arange(4))
+    result = record(make(_BASE, scenario), scenario, _SCALE_SEED + torch.arange(2))
     return metrics.rmse(result.error[:, 5:], result.worlds.scored[:, 5:])
 
 
