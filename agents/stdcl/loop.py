@@ -41,8 +41,8 @@ class NetworkLoop(Localizer[LoopBelief]):
 
     ``feedback``: ``positions``, the next step starts from the corrected positions and their
     variance; ``links``, the network's confidence weights each link; ``learned``, both; ``paper``,
-    links are weighted by equation 36 with the gain ``kappa``; ``none``. A confidence changes by 10 %
-    a step at most.
+    links are weighted by equation 36 with the gain ``kappa``; ``none``. A confidence changes by
+    10 % a step at most.
 
     Where gradients are required, feedback is differentiated through the next solution in first
     order, neighbours held: ∂y/∂m = λ H⁻¹, ∂y/∂c_ij = H⁻¹ W_ij (d̃_ij − ‖y_i − y_j‖) u_ij / c_ij.

@@ -13,7 +13,7 @@ from agents.swarm.confidence import ConfidenceKind
 from agents.swarm.dwmds_st import DynamicMds
 from agents.swarm.map import RecursiveMap
 from agents.weights import learned
-from coloc_env.options import Ratio
+from coloc_env.options import Count, Ratio
 from coloc_env.scenario import Believed
 
 Variant = Literal["calibrated", "paper"]
@@ -40,8 +40,8 @@ class StDcl(NetworkLoop):
     of equation 36. It decides what is not given of ``feedback`` (``learned``, ``paper``, ``none``,
     ``links``, ``positions``), ``confidence`` (the optimizer's) and ``weights`` (a checkpoint's name
     or path, or ``none``): each of the shipped ones was trained with one feedback and confidence.
-    ``kappa``: κ of equation 36. ``bank=true`` falls back to ``map`` for UAVs whose ranges that
-    predicts better.
+    ``kappa``: κ of equation 36. ``window`` and ``adaptive``: the optimizer's, which ``dwmds_st``
+    explains. ``bank=true`` falls back to ``map`` for UAVs whose ranges that predicts better.
     """
 
     name = "stdcl"
@@ -55,10 +55,17 @@ class StDcl(NetworkLoop):
         feedback: FeedbackKind | None = None,
         confidence: ConfidenceKind | None = None,
         kappa: Ratio = KAPPA,
+        window: Count = 0,
+        adaptive: bool = False,
         bank: BankOptions = BankOptions(bank=False),  # noqa: B008
     ) -> None:
         usual = _DEFAULTS[variant]
-        base = DynamicMds(believed, confidence=confidence or usual.confidence)
+        base = DynamicMds(
+            believed,
+            confidence=confidence or usual.confidence,
+            window=window,
+            adaptive=adaptive,
+        )
         network = learned(StGnn, weights or usual.weights)
         super().__init__(base, network, feedback or usual.feedback, kappa)
 

@@ -249,6 +249,15 @@ class SwarmFilter(Localizer[SwarmBelief]):
             return joint.pair_variance(at.joint)
         return at.variance.unsqueeze(-1) + at.variance.unsqueeze(-2)
 
+    def decay_rate(
+        self,
+        noise: Float64[Tensor, "B N"],
+        fixed: Bool[Tensor, "B N"],
+        dt: Float64[Tensor, "B N"],
+    ) -> float | Float64[Tensor, "B 1"]:
+        """λ of w(τ) = exp(−λ (t − τ)) in 1/s, in a step with this process ``noise`` (m²)."""
+        return self.decay
+
     def _window(self, belief: SwarmBelief, at: Predicted) -> RangeWindow | None:
         """The window of past steps, moved on to the present."""
         if not self.window:
@@ -258,7 +267,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             at.prior - belief.state[..., : self.process.dim],
             at.factor.masked_fill(at.fixed, 0.0),
             at.process_noise.masked_fill(at.fixed, at.fix_variance),
-            window.fading(self.decay, at.dt),
+            window.fading(self.decay_rate(at.process_noise, at.fixed, at.dt), at.dt),
         )
 
 

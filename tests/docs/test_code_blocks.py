@@ -70,6 +70,7 @@ def test_there_is_something_to_test() -> None:
     assert len(lines()) >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", scripts(), ids=shown)
 def test_python_runs(page: Path, tmp_path: Path) -> None:
     script = tmp_path / "page.py"

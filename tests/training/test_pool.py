@@ -51,6 +51,7 @@ def test_workers_that_cannot_be_are_refused(jobs: int, ray: str | None, why: str
 
 
 _PARENT = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
@@ -58,6 +59,7 @@ from units import Unit
 from training import pool
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     units = [Unit(Path(sys.argv[1]), str(i), seconds=300.0) for i in range(4)]
     list(pool.work(units, pool.Workers(2), lambda unit, size: None))
 """

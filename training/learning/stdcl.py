@@ -185,9 +185,7 @@ def stdcl(
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
     agent = f"{agent}:weights=none"
-    network = learned(
-        StGnn, start, seed, kernel=kernel, levels=levels, kinematic=name == "stdcl"
-    )
+    network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=name == "stdcl")
     loops: list[Any] = [make(agent, one) for one in scenarios]
     for loop in loops:
         loop.learn(network)

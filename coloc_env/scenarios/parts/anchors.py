@@ -63,8 +63,8 @@ class TdoaOptions(Group):
         if self.tdoa_anchors == 1:
             raise ValueError("tdoa_anchors=1 is not allowed: a difference is of two")
         places = anchor_places("tdoa_anchors", self.tdoa_anchors, room)
-        missing = {"dropout": self.tdoa_dropout, "radius": self.tdoa_radius}
-        return (Tdoa(places, self.tdoa_std, tags, **missing),)
+        lost, near = self.tdoa_dropout, self.tdoa_radius
+        return (Tdoa(places, self.tdoa_std, tags, dropout=lost, radius=near),)
 
 
 def anchor_places(

@@ -1,6 +1,7 @@
 """The loop between optimizer and network: equation 36, what a correction keeps, and variants."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from agents.swarm.joint import independent
 from agents.swarm.links import Links, lengths
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
-from tests.agents.stdcl.test_network import N, STD, step_of
+from tests.agents.stdcl.test_network import STD, N, step_of
 
 
 def no_correction() -> Correction:
@@ -102,7 +103,7 @@ def beliefs(agent: str, steps: int = 6, **overrides: Any) -> tuple[Any, list[Loo
 
 def test_the_papers_loop_lowers_confidences_step_by_step() -> None:
     _, each, _ = beliefs("stdcl:variant=paper:weights=none")
-    for one, other in zip(each, each[1:], strict=False):
+    for one, other in pairwise(each):
         assert (other.confidence <= one.confidence).all()
         assert (other.confidence >= 0.9 * one.confidence - 1e-12).all()
     assert float(each[-1].confidence.min()) < 0.8

@@ -239,7 +239,7 @@ SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
 
 
-def told(family: str, **overrides: Any) -> tuple[Any, ...]:
+def world_of(family: str, **overrides: Any) -> tuple[Any, ...]:
     """All that one world does in four steps, and what its team believes. UAVs that are steered are
     all sent one way; where they choose whom to call, UAV 0 calls 1, and 2 calls 3."""
     scenario = make_scenario(family, **SMALL.get(family, {}) | overrides)
@@ -279,7 +279,7 @@ def test_every_override_is_tried(family: str) -> None:
 @pytest.mark.parametrize(("family", "name"), EACH)
 def test_every_override_changes_something(family: str, name: str) -> None:
     others = WITH[family].get(name, {})
-    assert told(family, **others) != told(family, **others, **{name: CHANGED[family][name]})
+    assert world_of(family, **others) != world_of(family, **others, **{name: CHANGED[family][name]})
 
 
 @pytest.mark.parametrize(("family", "name"), EACH)

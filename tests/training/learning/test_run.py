@@ -86,7 +86,7 @@ def test_interrupted_in_saving(
         keep(file, state)
 
     keep = state_file.save
-    monkeypatch.setattr(states, "save", dies)
+    monkeypatch.setattr(state_file, "save", dies)
     with pytest.raises(SystemExit):
         runs.start("pfnn", {"mode": mode} | SMALL, tmp_path / "run", quiet)
     monkeypatch.undo()
@@ -98,6 +98,7 @@ def test_interrupted_in_saving(
     assert not list((tmp_path / "run").rglob(".*"))
 
 
+@pytest.mark.slow
 def test_killed(mode: str, unbroken: dict[str, bytes], tmp_path: Path) -> None:
     """kill -9 of the command, somewhere in an epoch after the first."""
     settings = [f"--set={key}={value}" for key, value in ({"mode": mode} | SMALL).items()]
@@ -279,6 +280,7 @@ def test_weights_that_are_nan_are_an_error(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "run/pfnn.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_loses_nothing(
     unbroken: dict[str, bytes], mode: str, tmp_path: Path
 ) -> None:
