@@ -160,19 +160,32 @@ def test_a_drift_that_is_estimated_beats_one_that_is_considered() -> None:
     assert errors[1] < errors[0]
 
 
-EVERYTHING = {
-    **{"n_uavs": 3, "landmarks": 5, "anchors": 4, "tags": 2, "tag_arm": 0.3, "tdoa_anchors": 4},
-    **{"angles": True, "gnss": True, "gnss_outage": 0.3, "flow": True, "barometer": True},
+EVERYTHING: dict[str, Any] = {
+    "n_uavs": 3,
+    "landmarks": 5,
+    "anchors": 4,
+    "tags": 2,
+    "tag_arm": 0.3,
+    "tdoa_anchors": 4,
+    "angles": True,
+    "gnss": True,
+    "gnss_outage": 0.3,
+    "flow": True,
+    "barometer": True,
 }
-AGENTS = (
-    *("ekf", "ekf:fusion=ci", "ekf:fusion=pairwise", "ekf:fusion=exchange", "ekf_joint"),
-    *("ekf:fusion=ci:second_order=true", "ekf_joint:second_order=true", "ekf:robust=huber+gate"),
-    *("ekf_trust", "emvf", "dfgo", "dfgo_central", "pf500", "apf", "pfnn", "pf_trust"),
+QUICK = (
+    *("ekf", "ekf:fusion=ci", "ekf:fusion=pairwise", "ekf:robust=huber+gate", "ekf_joint"),
+    *("ekf:fusion=ci:second_order=true", "ekf_joint:second_order=true", "emvf", "pf500"),
+)
+SLOW = (
+    *("ekf:fusion=exchange", "ekf_trust", "dfgo", "dfgo_central", "apf", "pfnn", "pf_trust"),
     *("pf500:proposal=ekf", "pf500:robust=huber", "hpff", "nnhpff"),
 )
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize(
+    "agent", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+)
 def test_everything_at_once_is_served(agent: str) -> None:
     """By every filter that serves whatever has a model: finite, and near the truth."""
     scenario = make_scenario("indoor-v0", **EVERYTHING)
