@@ -266,7 +266,18 @@ def _known(owner: str, key: str, known: Mapping[str, Option]) -> None:
 
 
 def _unfit(owner: str, option: Option, value: Any) -> str:
-    return f"{owner}: {option.name}={value!r} is not allowed: {option.words} is needed"
+    words = option.words
+    if "number" in words and _beyond(value):
+        words += f", at most {_MOST:g},"
+    return f"{owner}: {option.name}={value!r} is not allowed: {words} is needed"
+
+
+def _beyond(value: Any) -> bool:
+    """Whether a value is a number, or the text of one, that is larger than any may be."""
+    try:
+        return abs(float(value)) > _MOST
+    except (TypeError, ValueError, OverflowError):
+        return isinstance(value, int)
 
 
 def _plain(value: Any) -> Any:

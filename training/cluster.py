@@ -59,7 +59,7 @@ def _require_answer(address: str) -> None:
         raise ValueError(f"--ray {address} is not allowed: auto, or HOST:PORT of a cluster's head")
     if not _answers(address):
         raise ValueError(
-            f"--ray {address}: nobody answers there; `ray start --head` starts a cluster and prints "
+            f"--ray {address}: nobody answers there; `ray start --head` starts a cluster and says "
             "its address"
         )
 
@@ -122,7 +122,7 @@ def _require_alive(head: str) -> None:
     while not _answers(head):
         if time.monotonic() - start > _GONE:
             raise ConnectionError(
-                f"the Ray cluster at {head} is gone; what was stored is kept: start the cluster and "
+                f"the Ray cluster at {head} is gone; what was stored is kept: start a cluster and "
                 "run the command again"
             )
         time.sleep(1.0)

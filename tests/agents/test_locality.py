@@ -244,9 +244,9 @@ def test_a_failing_uav_takes_nobody_with_it(
     sample: SimpleNamespace, tools: SimpleNamespace
 ) -> None:
     """It goes silent and senses zeros; the others go on about as they would with it."""
-    failing = replace(sample.scenario, failures=((STRANGER, 1),))
+    failing = replace(sample.scenario, failures=((STRANGER, 2),))
     run = tools.play(sample.localizer, failing, (3, 4), len(sample.run.estimates))
-    assert not run.observations[1]["links"][:, STRANGER].any()
+    assert not run.observations[2]["links"][:, STRANGER].any()
     keep = [i for i in range(run.position.shape[2]) if i != STRANGER]
     for estimate in run.estimates:
         assert estimate.position.isfinite().all()

@@ -11,6 +11,7 @@ import typer
 
 from training.cli.options import (
     Data,
+    Device,
     Jobs,
     Ray,
     ScenarioName,
@@ -51,6 +52,7 @@ def evaluate(
         bool, typer.Option("--bound/--no-bound", help="Compute the posterior bound.")
     ] = True,
     threads: Threads = 1,
+    device: Device = "cpu",
     jobs: Jobs = 1,
     ray: Ray = None,
     data: Data = None,
@@ -77,6 +79,7 @@ def evaluate(
     from coloc_env.staging import staged_folder
 
     built = build_scenario(scenario, settings, threads, data)
+    from training.devices import checked_device
     from training.evaluation import files
     from training.evaluation.evaluate import evaluate as run
     from training.evaluation.evaluate import split_agents
@@ -86,10 +89,13 @@ def evaluate(
 
         plotly_script()  # what is not installed is said before anything runs
     names = split_agents(agents)
+    checked_device(device)
+    if device != "cpu" and (jobs > 1 or ray is not None):
+        raise ValueError(f"--device {device}: one process uses it, not those of --jobs or --ray")
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
         with workers_of(jobs, ray) as workers, progress() as bars:
-            found = run(built, names, runs, seed, bars, bound=bound, workers=workers)
+            found = run(built, names, runs, seed, bars, bound=bound, workers=workers, device=device)
         with suppress(OSError, SystemExit):  # where nobody reads it, the files are still written
             _show(found)
         files.write(found, folder)

@@ -30,6 +30,10 @@ Data = Annotated[
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the first world.")]
 Threads = Annotated[int, typer.Option(help="CPU threads of torch.")]
+Device = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="Where worlds, filters and networks are: **cpu**, **cuda**."),
+]
 Jobs = Annotated[int, typer.Option(help="Processes at once, of one thread each.")]
 Ray = Annotated[
     str | None,

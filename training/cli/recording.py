@@ -213,10 +213,12 @@ def calibrate(
     """
     from coloc_env.datasets.noise_model import write_noise_model
     from coloc_env.datasets.open_format import read_recording
-    from coloc_env.staging import staged_file
+    from coloc_env.staging import require_writable, staged_file
     from training.calibration.calibrate import calibrate as learn
     from training.calibration.calibrate import part_of
 
+    path = folder / "believed.yaml" if out is None else out
+    require_writable(path)
     found = read_recording(folder)
     if span is not None:
         found = part_of(found, _span(span))
@@ -241,7 +243,6 @@ def calibrate(
         notes = (*notes, *words)
     for note in notes:
         typer.echo(note)
-    path = folder / "believed.yaml" if out is None else out
     part = "all of it" if span is None else f"{span} s of it"
     with staged_file(path) as file:
         text = write_noise_model(model, f"{found.name}: calibrated on {part}")

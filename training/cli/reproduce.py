@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from training.cli.options import Data, Jobs, Ray, Seed, require_seed, workers_of
+from training.cli.options import Data, Device, Jobs, Ray, Seed, require_seed, workers_of
 from training.cli.terminal import progress
 from training.threads import use_threads
 
@@ -55,6 +55,7 @@ def reproduce(
     steps: Annotated[
         int | None, typer.Option(help="Cut runs to so many steps: for a first try.")
     ] = None,
+    device: Device = "cpu",
     jobs: Jobs = 1,
     ray: Ray = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Throw the store away first.")] = False,
@@ -92,11 +93,13 @@ def reproduce(
         os.environ["COLOC_DATA"] = str(data)
     require_seed(seed)
     use_threads(1)
+    from training.devices import checked_device
     from training.evaluation.evaluate import split_agents
     from training.reproduce.settings import Settings
     from training.reproduce.study import STUDIES
     from training.reproduce.study import reproduce as run
 
+    checked_device(device)
     chosen = STUDIES.require(study)()
     with workers_of(jobs, ray) as workers, progress() as bars:
         settings = Settings(
@@ -110,6 +113,7 @@ def reproduce(
             workers,
             fresh,
             report_only,
+            device,
         )
         run(chosen, settings, bars, lambda line: typer.echo(line, err=True))
     typer.echo(f"written to {out}/page.md")

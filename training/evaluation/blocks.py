@@ -21,15 +21,17 @@ _CODE = ("training.evaluation.record",)
 
 @dataclass(frozen=True, eq=False)
 class Team:
-    """An agent by name, in a scenario. Its localizer is made where it runs, and never sent."""
+    """An agent by name, in a scenario, on a device. Its localizer is made where it runs, and never
+    sent."""
 
     name: str
     scenario: Scenario
+    device: str = "cpu"
 
     @cached_property
     def localizer(self) -> Localizer[Any]:
         """ValueError if it cannot serve the scenario."""
-        return make(self.name, self.scenario)
+        return make(self.name, self.scenario).to(self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -59,7 +61,8 @@ class Block:
 
     def run(self, progress: Callable[[int], None]) -> RunRecord:
         seeds = torch.arange(self.seed, self.seed + self.runs)
-        return record(self.team.localizer, self.team.scenario, seeds, progress)
+        team = self.team
+        return record(team.localizer, team.scenario, seeds, progress, team.device)
 
 
 @dataclass(frozen=True, eq=False)

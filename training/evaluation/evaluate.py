@@ -42,6 +42,7 @@ def evaluate(
     bound: bool = True,
     chunk: int | None = None,
     workers: Workers = ALONE,
+    device: str = "cpu",
 ) -> Evaluation:
     """Run agents (names with options, ``"ekf:robust=huber"``) on the worlds of seeds ``seed`` …
     ``seed + runs − 1``.
@@ -49,7 +50,8 @@ def evaluate(
     ``progress(what, done, total)`` is called as work is done. ``bound``: compute the posterior
     bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
     are fast); no result depends on it, a localizer's own rounding aside. ``workers``: who computes;
-    no digit of a result depends on that, times a step aside, which are measured here at the end.
+    no digit of a result depends on that, times a step aside, which are measured here
+    at the end. ``device``: where worlds, filters and networks are.
 
     A run in which an agent's estimate is NaN or infinite, or that raises a numerical error, goes on
     with the last finite estimates (the prior before the first) and counts as diverged. An agent
@@ -57,7 +59,7 @@ def evaluate(
     first one's error is raised.
     """
     _check(agents, runs, seed, chunk)
-    teams = {name: Team(name, scenario) for name in agents}
+    teams = {name: Team(name, scenario, device) for name in agents}
     localizers = {name: team.localizer for name, team in teams.items()}
     truthful = tracked(scenario)
     units: list[Block | Bounded] = [Bounded(scenario, seed, runs)] if bound and truthful else []
@@ -85,7 +87,7 @@ def evaluate(
             continue
         try:
             whole = RunRecord.cat([part for _, part in sorted(parts[name].items())])
-            ms = ms_per_step(localizers[name], scenario, seed)
+            ms = ms_per_step(localizers[name], scenario, seed, device)
             records[name] = replace(whole, ms_per_step=ms)
         except Exception as error:
             errors[name] = error
@@ -93,7 +95,9 @@ def evaluate(
         raise errors[agents[0]]
     seeds = torch.arange(seed, seed + runs)
     without_truth = (
-        {} if truthful else {n: innovations(localizers[n], scenario, seeds) for n in records}
+        {}
+        if truthful
+        else {n: innovations(localizers[n], scenario, seeds, device) for n in records}
     )
     return Evaluation(
         scenario,
@@ -138,7 +142,7 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
 
 def _blocks(team: Team, seed: int, runs: int, chunk: int | None) -> list[Block]:
     """All runs of one agent, as many at once as are fast together: the same for all workers."""
-    at_once = chunk or _runs_at_once(team.localizer, team.scenario)
+    at_once = chunk or _runs_at_once(team)
     firsts = range(0, runs, at_once)
     return [Block(team, seed + first, min(at_once, runs - first)) for first in firsts]
 
@@ -166,25 +170,32 @@ def _accept_no_bound(scenario: Scenario, error: Exception) -> None:
 # ------------------------------------------------------------------ cost
 
 
-def _runs_at_once(localizer: Localizer, scenario: Scenario) -> int:
-    """How many runs are fastest together, from the size of one run's belief."""
+def _runs_at_once(team: Team) -> int:
+    """How many runs are fastest together, from the size of one run's belief: what fits the CPU's
+    caches, or half of a card's free memory."""
     try:
-        size = localizer.reset(World(scenario, window=1).reset(0)).bytes()
+        world = World(team.scenario, device=team.device, window=1)
+        size = team.localizer.reset(world.reset(0)).bytes()
     except NUMERICAL:
         return 1
-    return max(1, _FAST // (_WORKING_SET * max(1, size)))
+    on_card = world.device.type == "cuda" and torch.cuda.is_available()
+    fast = torch.cuda.mem_get_info(world.device)[0] // 2 if on_card else _FAST
+    return max(1, fast // (_WORKING_SET * max(1, size)))
 
 
-def ms_per_step(localizer: Localizer, scenario: Scenario, seed: int) -> float | None:
-    """Median time in ms of the whole team's step, one world, one thread; None if it raises."""
+def ms_per_step(
+    localizer: Localizer, scenario: Scenario, seed: int, device: str | torch.device = "cpu"
+) -> float | None:
+    """Median time in ms of the whole team's step, one world, one thread, on the ``device`` that the
+    localizer is on; None if it raises."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     times: list[float] = []
-    seeds = torch.tensor([seed])
+    given = (localizer, scenario, torch.tensor([seed]))
     try:
         while len(times) < _WARM_UP + _TIMED:
             steps = min(scenario.horizon, _WARM_UP + _TIMED - len(times))
-            times += [step.seconds for step in rollout(localizer, scenario, seeds, steps)]
+            times += [step.seconds for step in rollout(*given, steps, device=device, timed=True)]
     except Breakdown:
         return None
     finally:

@@ -13,7 +13,8 @@ class Settings:
     """``out``: folder of the store and the results; ``part`` of the study, or "all"; ``runs``:
     worlds of the main tables, seeded ``seed``, ``seed`` + 1, …; ``agents`` and ``variants``: these
     only (None: all); ``steps``: cut runs to so many (None: whole runs); ``workers``: who
-    computes; ``fresh``: throw the store away first; ``report_only``: compute nothing.
+    computes; ``fresh``: throw the store away first; ``report_only``: compute nothing;
+    ``device``: where runs are.
 
     Links in ``out`` are followed. Raises ValueError, in one line, for a value that is not allowed.
     """
@@ -28,6 +29,7 @@ class Settings:
     workers: Workers = ALONE
     fresh: bool = False
     report_only: bool = False
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         for name in ("runs", "steps"):

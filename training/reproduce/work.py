@@ -80,13 +80,14 @@ class Cell:
 @dataclass(frozen=True)
 class Piece:
     """A unit of work: agents in the worlds of ``runs`` seeds from ``seed`` on; no agents: the
-    worlds themselves (bounds)."""
+    worlds themselves (bounds). ``device``: where simulated runs are; kinds are on the CPU."""
 
     variant: Variant
     agents: tuple[str, ...]
     seed: int
     runs: int
     kind: Kind | None = None
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -222,6 +223,7 @@ def _settings(piece: Piece) -> dict[str, Any]:
         "weights": [weights_of(localizer) for localizer in localizers],
         "code": code_of(piece.variant.scenario, localizers, modules),
         "torch": str(torch.__version__),
+        **({} if piece.device == "cpu" else {"device": piece.device}),
     }
 
 
@@ -237,7 +239,8 @@ def run_agent(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
     scenario, (agent,) = piece.variant.build(), piece.agents
     of_world = agent == WORLD
     bound = of_world and piece.variant.bounded
-    found = evaluate(scenario, [agent], piece.runs, piece.seed, progress, bound=bound)
+    where = piece.device
+    found = evaluate(scenario, [agent], piece.runs, piece.seed, progress, bound=bound, device=where)
     arrays, facts = found.agents[agent].to_arrays()
     if of_world:
         arrays |= found.worlds.to_arrays()

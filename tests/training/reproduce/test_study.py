@@ -17,7 +17,16 @@ from training.reproduce.settings import Settings
 from training.reproduce.study import STUDIES, Part, Study, reproduce
 from training.reproduce.tables import by_agent, with_ends
 from training.reproduce.verdicts import Claim, Goal, mean_of
-from training.reproduce.work import POSTERIOR, SNAPSHOT, WORLD, Cell, Piece, Training, TrainingRun, Variant
+from training.reproduce.work import (
+    POSTERIOR,
+    SNAPSHOT,
+    WORLD,
+    Cell,
+    Piece,
+    Training,
+    TrainingRun,
+    Variant,
+)
 
 SMALL = Variant("small", "small", (("n_uavs", 2),), steps=12)
 OTHER = Variant("other", "other", (("n_uavs", 2), ("nlos", 0.3)), steps=12)
@@ -54,7 +63,9 @@ def results_of(out: Path, *cells: Cell, seed: int = 5) -> Results:
     return Results(Settings(out, 5, seed=seed), cells, cells)
 
 
-def run(out: Path, *cells: Cell, seed: int = 5, workers: Workers = ALONE) -> tuple[Results, list[str]]:
+def run(
+    out: Path, *cells: Cell, seed: int = 5, workers: Workers = ALONE
+) -> tuple[Results, list[str]]:
     """Everything run; the results, and what was reported."""
     lines: list[str] = []
     reproduce(small(*cells), Settings(out, 5, seed=seed, workers=workers), silent, lines.append)
