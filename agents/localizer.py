@@ -1,15 +1,16 @@
 """The Localizer protocol and its estimates."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Float32
 from tensordict import TensorClass
-from torch import Tensor
+from torch import Tensor, nn
 
 from agents.models.measurements import MODELS
 from agents.models.process import drives
+from agents.parts import parts_of
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Sensor
@@ -74,6 +75,18 @@ class Localizer(ABC, Generic[Belief]):
 
         Pure: neither argument is written to.
         """
+
+    def to(self, device: str | torch.device) -> Self:
+        """Move networks and constants to a device, in place; beliefs and observations decide where
+        everything else is computed."""
+        for part in parts_of(self):
+            if isinstance(part, nn.Module):
+                part.to(device)
+            elif hasattr(part, "__dict__") and not isinstance(part, Tensor):
+                for name, value in vars(part).items():
+                    if isinstance(value, Tensor):
+                        object.__setattr__(part, name, value.to(device))
+        return self
 
     @classmethod
     def ignores(cls, believed: Believed) -> list[str]:

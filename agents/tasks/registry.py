@@ -17,6 +17,7 @@ TASKS = Registry(
     "task",
     "coloc.tasks",
     {
+        "active-v0": "agents.tasks.active:Active",
         "beacon-hard-v0": "agents.tasks.beacon:BeaconHard",
         "beacon-v0": "agents.tasks.beacon:Beacon",
         "convoy-hard-v0": "agents.tasks.convoy:ConvoyHard",

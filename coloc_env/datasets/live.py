@@ -40,6 +40,9 @@ _COLUMNS = {
     "landmark_vectors": ("landmark", "x", "y", "z"),
     "uav_ranges": ("own_tag", "robot", "tag", "range"),
     "anchor_ranges": ("own_tag", "anchor", "range"),
+    "tdoa": ("own_tag", "from", "to", "difference"),
+    "arrival_angles": ("robot", "azimuth", "elevation"),
+    "flow": ("vx", "vy"),
     "height": ("height",),
     "position_fix": ("x", "y", "z"),
 }

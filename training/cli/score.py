@@ -1,7 +1,7 @@
 """``coloc tasks`` and ``coloc score``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,7 +15,8 @@ def tasks(
         typer.Argument(metavar="[TASK]", help="Show this task's options; none: list all."),
     ] = None,
 ) -> None:
-    """List the tasks in which decisions matter, or one task's options and heuristics.
+    """List the tasks in which decisions matter, with stored scores, or one task's options and
+    heuristics.
 
     **Examples**
 
@@ -24,10 +25,13 @@ def tasks(
     coloc tasks survey-v0
     """
     from agents.tasks import TASKS
+    from agents.tasks.leaderboard import scores
     from coloc_env.options import paragraphs
 
     if name is None:
-        show(["task", ""], [[key, TASKS.summary(key)] for key in TASKS])
+        found = scores()
+        lines = [[key, _best(found.get(key, [])), TASKS.summary(key)] for key in TASKS]
+        show(["task", "returns: random, best known", ""], lines)
         typer.echo("coloc tasks TASK lists its options and its heuristics.")
         return
     explain(name, TASKS, "option")
@@ -37,6 +41,13 @@ def tasks(
         if rows:
             typer.echo("")
             show([{"policies": "heuristic", "planners": "planner"}[what], ""], rows)
+
+
+def _best(stored: list[dict[str, Any]]) -> str:
+    """Returns of random actions and of the best of some stored scores, the best first."""
+    if not stored:
+        return ""
+    return f"{stored[0]['random']:.1f}, {stored[0]['return']:.1f} ({stored[0]['label']})"
 
 
 def score(

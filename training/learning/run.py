@@ -30,6 +30,7 @@ from training.learning import curves
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
 from training.learning.registry import TRAININGS
+from training.pool import ALONE, Workers
 from training.threads import use_threads
 
 Progress = Callable[[str, int, int], None]
@@ -117,12 +118,19 @@ def make_trainer(
     )
 
 
-def start(name: str, chosen: Mapping[str, Any], out: Path, progress: Progress) -> Path:
-    """Train from the beginning, in the folder ``out``; returns the weights' file. Raises ValueError
-    for options that do not fit, or a folder in use, before anything is written."""
+def start(
+    name: str,
+    chosen: Mapping[str, Any],
+    out: Path,
+    progress: Progress,
+    workers: Workers = ALONE,
+) -> Path:
+    """Train from the beginning, in the folder ``out``; returns the weights' file. Rollouts are
+    spread over ``workers``. Raises ValueError for options that do not fit, a training that workers
+    cannot share, or a folder in use, before anything is written."""
     chosen = options.checked(name, chosen, TRAININGS.options_of(name))
     _require_new(out)
-    training = _built(name, chosen)
+    training = _spread(name, _built(name, chosen), workers)
     config = {
         "training": name,
         "options": dict(chosen),
@@ -160,7 +168,7 @@ def _recipe(source: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]
     return config["training"], config["options"]
 
 
-def resume(folder: Path, progress: Progress) -> Path:
+def resume(folder: Path, progress: Progress, workers: Workers = ALONE) -> Path:
     """Continue the run in a folder to the weights that it would have had if it had never stopped;
     returns their file."""
     config = _config(folder)
@@ -170,7 +178,9 @@ def resume(folder: Path, progress: Progress) -> Path:
     with _alone(folder):
         remove_leftovers(folder)
         use_threads(config["threads"], f"{folder / _CONFIG}: threads")
-        return _train(folder, config, _built(config["training"], config["options"]), progress)
+        name = config["training"]
+        training = _spread(name, _built(name, config["options"]), workers)
+        return _train(folder, config, training, progress)
 
 
 def _train(folder: Path, config: Mapping[str, Any], training: Training, progress: Progress) -> Path:
@@ -216,6 +226,16 @@ def _built(name: str, chosen: Mapping[str, Any]) -> Training:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise
         raise ValueError(f"{name}: these options need more memory than there is") from None
+    return training
+
+
+def _spread(name: str, training: Training, workers: Workers) -> Training:
+    """The training, its rollouts on workers; ValueError if they cannot be spread."""
+    if workers == ALONE:
+        return training
+    from training.learning.episodes import spread
+
+    spread(name, training.collector, workers)
     return training
 
 

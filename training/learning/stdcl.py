@@ -156,7 +156,7 @@ def stdcl(
     agent: str = "stdcl",
     start: str = "none",
     kernel: Annotated[int, Quantity("steps", 1, 100)] = 3,
-    convolutions: bool = True,
+    levels: Annotated[int, Quantity("", 0, 6)] = 3,
     worlds: Worlds = 4,
     epochs: Epochs = 10,
     steps: Steps = 10,
@@ -173,7 +173,7 @@ def stdcl(
     ``scenario``, separated by slashes) are run by ``agent`` (``stdcl`` with any options but
     weights, or ``stgat``) with its newest weights; every ``steps`` steps the loss is backpropagated
     through them. ``start``: weights to start from, a checkpoint's name or path; else the network
-    is a new one with this ``kernel`` in time, or without ``convolutions``.
+    is a new one with this ``kernel`` in time and convolutions in so many ``levels`` (0: none).
     From the share ``smooth_from`` of the epochs on it contains the trajectory's second difference.
     The learning rate falls from ``learning_rate`` to ``last_rate`` along a cosine. ``augment``: the
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
@@ -185,9 +185,7 @@ def stdcl(
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
     agent = f"{agent}:weights=none"
-    network = learned(
-        StGnn, start, seed, kernel=kernel, temporal=convolutions, kinematic=name == "stdcl"
-    )
+    network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=name == "stdcl")
     loops: list[Any] = [make(agent, one) for one in scenarios]
     for loop in loops:
         loop.learn(network)

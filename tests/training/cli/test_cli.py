@@ -47,7 +47,7 @@ def test_evaluate(tmp_path: Path) -> None:
     assert json.loads((out / "results.json").read_text())["bound"] == {"rmse": None}
 
 
-def test_what_raises_is_told(tmp_path: Path) -> None:
+def test_what_raises_is_reported(tmp_path: Path) -> None:
     done = evaluate(tmp_path / "out", "--agents", "test_still:wrong=raises", "--no-figures")
     assert done.exit_code == 0
     assert done.stderr == (
@@ -258,6 +258,8 @@ def test_lists() -> None:
     options = coloc("agents", "test_still").stdout
     assert "offset" in options
     assert "a number" in options
+    assert "(frontier)" in coloc("tasks").stdout
+    assert "frontier" in coloc("tasks", "survey-v0").stdout
 
 
 @pytest.mark.parametrize(
@@ -298,7 +300,7 @@ def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
                 break
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=120)
     finally:
         process.kill()
     assert (process.returncode, errors) == (130, b"interrupted\n")
