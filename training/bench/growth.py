@@ -1,4 +1,4 @@
-"""``coloc bench --growth``: time and memory of a step against UAVs, worlds, particles, landmarks."""
+"""``coloc bench --growth``: a step's time and memory against UAVs, worlds, particles, landmarks."""
 
 from __future__ import annotations
 
