@@ -116,7 +116,6 @@ def test_a_picture() -> None:
         ["reproduce", "cspf"],
         ["render", "indoor-v0"],
         ["bench"],
-        ["train", "ippo"],
     ],
     ids=lambda words: words[0],
 )
