@@ -22,6 +22,7 @@ LOCALIZERS = Registry(
         "dead_reckoning": "agents.kalman.dead_reckoning:DeadReckoning",
         "dfgo": "agents.factor_graph.dfgo:DistributedFactorGraph",
         "dfgo_central": "agents.factor_graph.dfgo_central:CentralFactorGraph",
+        "dlspf": "agents.particle.dlspf:LatentParticleFilter",
         "dwmds": "agents.swarm.dwmds:CostaMds",
         "dwmds_st": "agents.swarm.dwmds_st:DynamicMds",
         "ekf": "agents.kalman.ekf:CooperativeEkf",
@@ -47,6 +48,7 @@ LOCALIZERS = Registry(
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
         "stgat": "agents.stdcl.stgat:StGat",
+        "ukf": "agents.kalman.ukf:UnscentedFilter",
         "vmds": "agents.swarm.vmds:VelocityMds",
     },
 )

@@ -123,6 +123,8 @@ CHOSEN = {
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
     "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
     "dfgo_central": ("default", "imu_bias", "plane"),
+    "dlspf": ("default", "uniform", "imu_bias", "anchors", "slots", "tags"),
+    "ukf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
