@@ -120,7 +120,7 @@ class UnscentedFilter(GaussianFilter):
         self, x: Float[Tensor, "B N M k"]
     ) -> tuple[Float[Tensor, "B N k"], Float[Tensor, "B N M k"]]:
         """Mean over sigma points, and what is left of them."""
-        mean = (self.mean_weights.to(x.device) @ x).unsqueeze(-2)
+        mean = (self.mean_weights.to(x.device).unsqueeze(-1) * x).sum(-2, keepdim=True)
         return mean[..., 0, :], x - mean
 
     def _product(

@@ -9,7 +9,7 @@ from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Neighbours, make_measurements, no_neighbours, received
 from agents.models.process import Process, make_process
-from agents.particle import sampling
+from agents.particle import particle_count, sampling
 from agents.particle.belief import normal, own_keys
 from agents.particle.cloud import moments, select
 from agents.particle.degeneracy import degenerate
@@ -98,7 +98,7 @@ class LatentParticleFilter(Localizer[LatentBelief]):
         mean, covariance = self.process.initial(observation["prior"])
         key, m = own_keys(observation, self.seed), self.capacity
         states = sampling.from_prior(self.process, self.believed, mean, covariance, key, m)
-        equal = torch.full_like(states[..., 0], -torch.tensor(float(m)).log())
+        equal = self._equal_log_weights(key)
         reference = moments(self.process, states, equal.exp()).mean
         return LatentBelief(
             reference=reference,
@@ -175,7 +175,7 @@ class LatentParticleFilter(Localizer[LatentBelief]):
         draws = normal(key, "dlspf.restart", self.process.error_size, self.capacity)
         state = state.to(torch.float32)
         fresh = self._at_rest(sampling.gaussian(self.process, state, covariance, draws), state)
-        equal = torch.full_like(belief.log_weights, -torch.tensor(float(self.capacity)).log())
+        equal = self._equal_log_weights(key)
         return belief.replace(
             reference=torch.where(row, state, belief.reference),
             particles=torch.where(row.unsqueeze(-1), fresh, belief.particles),
@@ -192,6 +192,10 @@ class LatentParticleFilter(Localizer[LatentBelief]):
         return own
 
     # ---------------------------------------------------------------- to latent states and back
+
+    def _equal_log_weights(self, key: Int64[Tensor, "B N"]) -> Float32[Tensor, "B N M"]:
+        count = torch.full_like(key, self.capacity)
+        return particle_count.equal_log_weights(particle_count.alive(count, self.capacity))
 
     def _newest(self, error: Float32[Tensor, "B N M E"]) -> Float32[Tensor, "B N M 6"]:
         """[δp, T δv] of an error."""

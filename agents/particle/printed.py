@@ -72,7 +72,7 @@ class PrintedResampling(Resampling):
         log_weights: Float32[Tensor, "B N M"],
     ) -> Moments:
         """The resampled cloud (Algorithm 1, lines 26 and 27)."""
-        return moments(self.process, particles, log_weights.exp())
+        return moments(self.space, particles, log_weights.exp())
 
 
 def anywhere(believed: Believed) -> Believed:
