@@ -6,6 +6,7 @@ TRAININGS = Registry(
     "training",
     "coloc.trainings",
     {
+        "dlspf": "training.learning.dlspf:dlspf",
         "ippo": "training.learning.mappo:ippo",
         "mappo": "training.learning.mappo:mappo",
         "nnhpff": "training.learning.nnhpff:nnhpff",
@@ -16,6 +17,7 @@ TRAININGS = Registry(
         "task-qmix": "training.learning.tasks.qmix:task_qmix",
         "task-sb3-ppo": "training.learning.tasks.sb3:task_sb3_ppo",
         "stdcl": "training.learning.stdcl:stdcl",
+        "stdcl_factors": "training.learning.stdcl_factors:stdcl_factors",
         "trust": "training.learning.trust:trust",
     },
 )

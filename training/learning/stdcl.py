@@ -179,9 +179,7 @@ def stdcl(
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
     are compared at the end.
     """
-    scenarios = [
-        parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
-    ]
+    scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl", scenarios, steps)
     name = agent.split(":")[0]
     if name not in METHODS:
@@ -233,7 +231,7 @@ def score(
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        scenario = parse_scenario(f"swarm-v0:{variant}".rstrip(":"))
+        scenario = parse_scenario("swarm-v0", variant)
         loop: Any = make(agent, scenario)
         loop.learn(network)
         each = {}

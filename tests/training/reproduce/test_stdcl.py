@@ -204,7 +204,7 @@ def test_weights_are_those_of_the_step(tmp_path: Path) -> None:
     variant = plan.Worlds(12, 6).swarm("tiny", "tiny", uwb_dropout=0.3)
     piece = Piece(variant, (f"{OPTIMIZER}:confidence=none",), 3, 1, LINKS)
     seen: list[int] = []
-    piece.run(tmp_path, seen.append)
+    piece.keep(tmp_path, piece.run(seen.append))
     assert sum(seen) == piece.size
     one = links.load_links(variant, *piece.load(Results(Settings(tmp_path, 1), [], []).store))
     there = np.isfinite(one.range)
