@@ -190,6 +190,7 @@ def drawn(results: Results) -> Figure | None:
     m/s. (b) How far an anchor's wrong fix moves others, by hops from it: mean and largest, of the
     fix's error."""
     there = results.runs(W.speed(plan.FAST).key, [WORLD, *WATCHED])
+    there = {agent: one for agent, one in there.items() if theory.settles(one)}
     spread = {
         v.title: results.get(v.key, HUBER, DIFFUSION)
         for v in (W.sparse(2000.0), W.speed(plan.MODERATE))
