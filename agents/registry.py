@@ -22,6 +22,7 @@ LOCALIZERS = Registry(
         "dead_reckoning": "agents.kalman.dead_reckoning:DeadReckoning",
         "dfgo": "agents.factor_graph.dfgo:DistributedFactorGraph",
         "dfgo_central": "agents.factor_graph.dfgo_central:CentralFactorGraph",
+        "dlspf": "agents.particle.dlspf:LatentParticleFilter",
         "dwmds": "agents.swarm.dwmds:CostaMds",
         "dwmds_st": "agents.swarm.dwmds_st:DynamicMds",
         "ekf": "agents.kalman.ekf:CooperativeEkf",
@@ -48,6 +49,7 @@ LOCALIZERS = Registry(
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
         "stdcl_factors": "agents.stdcl.factors.localizer:LearnedFactors",
         "stgat": "agents.stdcl.stgat:StGat",
+        "ukf": "agents.kalman.ukf:UnscentedFilter",
         "vmds": "agents.swarm.vmds:VelocityMds",
     },
 )
@@ -72,12 +74,7 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
             texts[-1] += f":{piece}"
         else:
             texts.append(piece)
-    for text in texts:
-        key, value = options.parse(name, text, known)
-        if key in chosen:
-            raise ValueError(f"{name}: {key} is given twice")
-        chosen[key] = value
-    chosen = options.checked(name, chosen, known)
+    chosen = options.checked(name, options.parse_all(name, texts, known, chosen), known)
     believed: Believed = getattr(scenario, "believed", scenario)  # type: ignore[arg-type]
     _require_served(name, factory, believed)
     build = getattr(factory, "for_team", factory)

@@ -107,10 +107,11 @@ class DeadReckoning:
         self, observation: Observation, position: Float64[Tensor, "B N d"]
     ) -> tuple[Bool[Tensor, "B N"], Float64[Tensor, "B N d"], float]:
         """Who has a position fix, the predicted positions with the fixes in their place (m), and
-        the variance of fixes (m²)."""
+        the variance of fixes (m², of the axis that they know least of)."""
         if self.fix is None:
             return torch.zeros_like(position[..., 0], dtype=torch.bool), position, 0.0
         there = observation["position_fix_mask"] > 0
         z, there = usable(observation["position_fix"].double().unsqueeze(-2), there)
         fix, fixed = z[..., 0, :], there[..., 0]
-        return fixed, torch.where(fixed.unsqueeze(-1), fix, position), self.fix.std**2
+        least = max(self.fix.axis_std(position.shape[-1]))
+        return fixed, torch.where(fixed.unsqueeze(-1), fix, position), least**2

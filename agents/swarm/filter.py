@@ -21,7 +21,16 @@ from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Ins,
+    OpticalFlow,
+    PositionFix,
+    Ranging,
+    SlowFlight,
+    Tdoa,
+)
 
 _MIN_VARIANCE = 1e-6  # m² per axis: of a prior that is believed to be exact
 
@@ -34,8 +43,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
-    # Teams with anchors, heights or slow flight are served through ``agents.swarm.anchored``.
-    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight)
+    # Teams with more than ranges between UAVs are served through ``agents.swarm.anchored``.
+    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight, OpticalFlow, Tdoa)
     window = 0  # past steps in the stress
     decay = 0.0  # λ of w(τ) = exp(−λ (t − τ)), 1/s
     recursive = True  # the solution has dead reckoning as its prior
@@ -240,6 +249,15 @@ class SwarmFilter(Localizer[SwarmBelief]):
             return joint.pair_variance(at.joint)
         return at.variance.unsqueeze(-1) + at.variance.unsqueeze(-2)
 
+    def decay_rate(
+        self,
+        noise: Float64[Tensor, "B N"],
+        fixed: Bool[Tensor, "B N"],
+        dt: Float64[Tensor, "B N"],
+    ) -> float | Float64[Tensor, "B 1"]:
+        """λ of w(τ) = exp(−λ (t − τ)) in 1/s, in a step with this process ``noise`` (m²)."""
+        return self.decay
+
     def _window(self, belief: SwarmBelief, at: Predicted) -> RangeWindow | None:
         """The window of past steps, moved on to the present."""
         if not self.window:
@@ -249,7 +267,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             at.prior - belief.state[..., : self.process.dim],
             at.factor.masked_fill(at.fixed, 0.0),
             at.process_noise.masked_fill(at.fixed, at.fix_variance),
-            window.fading(self.decay, at.dt),
+            window.fading(self.decay_rate(at.process_noise, at.fixed, at.dt), at.dt),
         )
 
 

@@ -153,9 +153,7 @@ def stdcl_factors(
     from ``learning_rate`` to ``last_rate`` along a cosine, batch by batch. ``score_runs``:
     held-out worlds in which ``map`` with and without learned factors is compared at the end.
     """
-    scenarios = [
-        parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
-    ]
+    scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl_factors", scenarios, steps)
     network = learned(FactorNetwork, start, seed, width=width)
     localizers: list[Any] = [make(_AGENT, one) for one in scenarios]
@@ -215,7 +213,7 @@ def score(
     0 … runs − 1 of some variants."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        one = parse_scenario(f"{scenario}:{variant}".rstrip(":"))
+        one = parse_scenario(scenario, variant)
         localizer: Any = make(_AGENT, one)
         localizer.learn(network)
         each = {}
