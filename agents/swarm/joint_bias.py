@@ -90,7 +90,7 @@ def at_fixes(
     pairs = here.unsqueeze(-1) & here.unsqueeze(-2)
     p = joint_covariance(joint, delays)[:, coordinates]
     s = torch.where(pairs, p[..., coordinates], 0.0)
-    s = s + torch.where(here, fix_variance, 1.0).diag_embed()
+    s = s + torch.where(here, fix_variance, s.new_ones(here.shape)).diag_embed()
     cross = torch.where(pairs, known[:, coordinates][..., coordinates], 0.0)
     gain = torch.linalg.solve(s, cross.mT).mT  # K
     by = torch.where(here, innovation[:, rows].flatten(1), 0.0).unsqueeze(-1)

@@ -2,11 +2,11 @@
 keeps all correlations."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+from dataclasses import fields, replace
+from typing import Any, Literal, TypeVar
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.swarm import delays as clocks
@@ -28,6 +28,7 @@ from coloc_env.scenario import Believed
 
 _FIRST_STEP_REPEATS = 3  # further solutions of a first step
 _PASSES, _FIRST_PASSES = 3, 5  # of expectation propagation, in a step and in the first
+_T = TypeVar("_T", Sites, Solution)
 Adjust = Callable[[int, StepInput, Cavity, Sites], Sites]
 
 
@@ -71,7 +72,7 @@ class RecursiveMap(JointGaussNewton):
         precision = joint.information_of(covariance, fixed)  # Λ = P⁻¹
         first = (belief.step == 0).any(-1)
         if self.propagates:
-            solution = self._propagated(inputs, precision, bool(first.any()), adjust)
+            solution = self._propagated(inputs, precision, first, adjust)
         else:
             solution = self._weighted(inputs, precision, first[:, None, None])
         return self._with_biases(inputs, precision, solution)
@@ -80,7 +81,7 @@ class RecursiveMap(JointGaussNewton):
         self,
         inputs: StepInput,
         precision: Float64[Tensor, "B K K"],
-        first: bool,
+        first: Bool[Tensor, "B"],
         adjust: Adjust | None,
     ) -> Solution:
         """By expectation propagation: sites from the posterior, the posterior from the sites."""
@@ -88,7 +89,8 @@ class RecursiveMap(JointGaussNewton):
         solution = Solution(inputs.prior, inputs.variance, inputs.joint, delays=delays)
         nothing = torch.zeros_like(inputs.pair_variance)
         found = sites = Sites(nothing, nothing, nothing)
-        for k in range(_FIRST_PASSES if first else _PASSES):
+        for k in range(_FIRST_PASSES if bool(first.any()) else _PASSES):
+            before = sites, solution
             assert solution.joint is not None
             known = inputs.delays if solution.delays is None else solution.delays
             variance = length_variance(solution.joint, known, solution.position)
@@ -96,6 +98,9 @@ class RecursiveMap(JointGaussNewton):
             found = sites_by_moments(at, inputs, self.std, found if k else None)
             sites = found if adjust is None else adjust(k, inputs, at, found)
             solution = self._by_sites(inputs, precision, solution.position, sites)
+            if k >= _PASSES:  # other worlds have had all of theirs
+                sites = _of_worlds(first, sites, before[0])
+                solution = _of_worlds(first, solution, before[1])
         return replace(solution, outlier=sites.outlier)
 
     def _by_sites(
@@ -149,3 +154,16 @@ class RecursiveMap(JointGaussNewton):
         posterior = clocks.joint_covariance(solution.joint, delays)
         found = joint_bias.update(inputs.ins_bias, inputs.joint_bias, moved, precision, posterior)
         return replace(solution, joint_bias=found)
+
+
+def _of_worlds(chosen: Bool[Tensor, "B"], these: _T, others: _T) -> _T:
+    """The ``chosen`` worlds of the one, and the rest of the other."""
+    parts: dict[str, Any] = {}
+    for field in fields(these):
+        one, other = getattr(these, field.name), getattr(others, field.name)
+        if isinstance(one, Tensor):
+            parts[field.name] = torch.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+        elif one is not None:  # a tensorclass of batch (B, N)
+            rows = chosen.unsqueeze(-1).expand(one.batch_size)
+            parts[field.name] = one.where(rows, other)
+    return replace(these, **parts)

@@ -252,4 +252,5 @@ def test_a_failing_uav_takes_nobody_with_it(
         assert estimate.position.isfinite().all()
         assert (torch.linalg.eigvalsh(estimate.covariance[:, keep].double()) > 0).all()
     apart = (run.position - sample.run.position)[-1][:, keep].norm(dim=-1)
-    assert apart.median() < 0.5
+    limit = 1.0 if sample.family == "ranges" else 0.5  # without landmarks and anchors teams float
+    assert apart.median() < limit

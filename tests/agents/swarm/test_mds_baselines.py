@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from agents import make
-from agents.swarm import delays, ins_bias, window
+from agents.swarm import delays, ins_bias, joint_bias, window
 from agents.swarm.belief import StepInput, SwarmBelief, with_finite_prior
 from agents.swarm.calibration import prior_model
 from agents.swarm.fcmds import completed_step
@@ -84,6 +84,7 @@ def belief(inputs: StepInput, step: int = 1) -> SwarmBelief:
         variance=inputs.variance,
         joint=inputs.joint,
         ins_bias=ins_bias.initial(inputs.prior, None),
+        joint_bias=joint_bias.initial(inputs.prior, inputs.delays, None, False),
         transitions=inputs.transitions.unsqueeze(1).expand(-1, shape[1], -1, -1),
         link_memory=inputs.variance.new_zeros(*shape, 0),
         localizable=inputs.fixed,
