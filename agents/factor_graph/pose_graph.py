@@ -123,8 +123,10 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
             step=belief.step + 1,
         )
         if after.track.shape[2] % self.every == 0:
-            solved = [self._solved(row) for row in after.unbind(0)]
-            estimate, covariance = (torch.stack(part) for part in zip(*solved, strict=True))
+            solved = [self._solved(row) for row in after.to("cpu").unbind(0)]  # where GTSAM works
+            estimate, covariance = (
+                torch.stack(part).to(moved.device) for part in zip(*solved, strict=True)
+            )
             after = after.replace(estimate=estimate, covariance=covariance)
         origin = observation["reference"].double()
         return after, self.world_estimate(

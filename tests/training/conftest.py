@@ -1,7 +1,9 @@
 """A tiny localizer for the tests, registered while a module of them runs, and made-up results."""
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, ConstantVelocity, Prior, Scenario
 from training.evaluation.record import RunRecord, Worlds
 from training.evaluation.results import Evaluation
+
+sys.path.insert(0, str(Path(__file__).parent))  # units.py, also for processes that tests start
 
 
 class Belief(TensorClass["nocast"]):

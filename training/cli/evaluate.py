@@ -11,12 +11,16 @@ import typer
 
 from training.cli.options import (
     Data,
+    Device,
+    Jobs,
+    Ray,
     ScenarioName,
     Seed,
     Settings,
     Threads,
     build_scenario,
     require_seed,
+    workers_of,
 )
 from training.cli.terminal import progress, show
 
@@ -48,6 +52,9 @@ def evaluate(
         bool, typer.Option("--bound/--no-bound", help="Compute the posterior bound.")
     ] = True,
     threads: Threads = 1,
+    device: Device = "cpu",
+    jobs: Jobs = 1,
+    ray: Ray = None,
     data: Data = None,
 ) -> None:
     """Let agents meet the same worlds, and write how well each localizes.
@@ -64,12 +71,15 @@ def evaluate(
     coloc evaluate indoor-v0 --agents ekf,ekf:robust=huber --set nlos=0.3 --set landmarks=5
     --out results/hard
 
+    coloc evaluate indoor-v0 --agents ekf,pf500,apf --runs 1000 --ray auto --out results/many
+
     coloc evaluate replay-mrclam-v0 --agents dead_reckoning,ekf --data ~/recordings --out results/uw
     """
     require_seed(seed)
     from coloc_env.staging import staged_folder
 
     built = build_scenario(scenario, settings, threads, data)
+    from training.devices import checked_device
     from training.evaluation import files
     from training.evaluation.evaluate import evaluate as run
     from training.evaluation.evaluate import split_agents
@@ -79,10 +89,13 @@ def evaluate(
 
         plotly_script()  # what is not installed is said before anything runs
     names = split_agents(agents)
+    checked_device(device)
+    if device != "cpu" and (jobs > 1 or ray is not None):
+        raise ValueError(f"--device {device}: one process uses it, not those of --jobs or --ray")
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
-        with progress() as bars:
-            found = run(built, names, runs, seed, bars, bound=bound)
+        with workers_of(jobs, ray) as workers, progress() as bars:
+            found = run(built, names, runs, seed, bars, bound=bound, workers=workers, device=device)
         with suppress(OSError, SystemExit):  # where nobody reads it, the files are still written
             _show(found)
         files.write(found, folder)

@@ -1,6 +1,8 @@
 """Options that several commands have in common, and what they mean."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +12,7 @@ from training.threads import use_threads
 
 if TYPE_CHECKING:
     from coloc_env.scenario import Scenario
+    from training.pool import Workers
 
 ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="See **coloc scenarios**.")]
 Settings = Annotated[
@@ -27,6 +30,19 @@ Data = Annotated[
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the first world.")]
 Threads = Annotated[int, typer.Option(help="CPU threads of torch.")]
+Device = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="Where worlds, filters and networks are: **cpu**, **cuda**."),
+]
+Jobs = Annotated[int, typer.Option(help="Processes at once, of one thread each.")]
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Work on the Ray cluster at HOST:PORT; **auto**: the one that runs on this machine.",
+    ),
+]
 
 
 def build_scenario(
@@ -38,10 +54,25 @@ def build_scenario(
         os.environ["COLOC_DATA"] = str(data)
     from dataclasses import replace
 
-    from coloc_env.scenarios import make_scenario, parse_override
+    from coloc_env.scenarios import make_scenario, parse_overrides
 
-    overrides = dict(parse_override(name, text) for text in settings or ())
+    overrides = parse_overrides(name, settings or ())
     return replace(make_scenario(name, **overrides), overrides=overrides)
+
+
+@contextmanager
+def workers_of(jobs: int, ray: str | None) -> Iterator["Workers"]:
+    """Who computes, connected; what is not there is said before anything runs."""
+    from training.pool import Workers
+
+    workers = Workers(jobs, ray)
+    if ray is None:
+        yield workers
+        return
+    from training.cluster import connected
+
+    with connected(ray):
+        yield workers
 
 
 def require_seed(seed: int) -> None:

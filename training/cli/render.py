@@ -8,6 +8,7 @@ import typer
 
 from training.cli.options import (
     Data,
+    Device,
     ScenarioName,
     Seed,
     Settings,
@@ -28,6 +29,7 @@ def render(
     seed: Seed = 0,
     settings: Settings = None,
     threads: Threads = 1,
+    device: Device = "cpu",
     data: Data = None,
 ) -> None:
     """Draw a world and what an agent makes of it.
@@ -48,14 +50,17 @@ def render(
     if not 1 <= steps <= built.horizon:
         raise ValueError(f"--steps {steps} is not allowed: 1 to {built.horizon} for {scenario}")
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend, say, is not here
+    from agents.registry import make
     from coloc_env.render import frame_to_png, save_animation
+    from training.devices import checked_device
     from training.evaluation.animation import frames
-    from training.evaluation.evaluate import make
+
+    on = checked_device(device)
 
     every = steps if suffix == ".png" else -(-steps // _FRAMES)
     with staged_file(out) as file, progress() as bars:
-        localizer = make(agent, built)
-        drawn = frames(localizer, built, seed, steps, every, lambda k: bars(agent, k, steps))
+        localizer = make(agent, built).to(on)
+        drawn = frames(localizer, built, seed, steps, every, lambda k: bars(agent, k, steps), on)
         if suffix == ".png":
             frame_to_png(list(drawn)[-1], file)
         else:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from training.cli.options import Data, Seed, require_seed
+from training.cli.options import Data, Device, Jobs, Ray, Seed, require_seed, workers_of
 from training.cli.terminal import progress
 from training.threads import use_threads
 
@@ -55,7 +55,9 @@ def reproduce(
     steps: Annotated[
         int | None, typer.Option(help="Cut runs to so many steps: for a first try.")
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes at once, of one thread each.")] = 1,
+    device: Device = "cpu",
+    jobs: Jobs = 1,
+    ray: Ray = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Throw the store away first.")] = False,
     data: Data = None,
 ) -> None:
@@ -73,6 +75,8 @@ def reproduce(
 
     coloc reproduce pfnn --out results/pfnn --jobs 2
 
+    coloc reproduce pfnn --out results/pfnn --ray auto
+
     coloc reproduce pfnn --out results/quick --part paper --runs 4 --steps 200
 
     coloc reproduce pfnn --out results/pfnn --part robustness --agents ekf,ekf_trust
@@ -89,25 +93,28 @@ def reproduce(
         os.environ["COLOC_DATA"] = str(data)
     require_seed(seed)
     use_threads(1)
+    from training.devices import checked_device
     from training.evaluation.evaluate import split_agents
     from training.reproduce.settings import Settings
     from training.reproduce.study import STUDIES
     from training.reproduce.study import reproduce as run
 
+    checked_device(device)
     chosen = STUDIES.require(study)()
-    settings = Settings(
-        out,
-        chosen.runs if runs is None else runs,
-        part,
-        seed,
-        None if agents is None else split_agents(agents),
-        None if variants is None else variants.split(","),
-        steps,
-        jobs,
-        fresh,
-        report_only,
-    )
-    with progress() as bars:
+    with workers_of(jobs, ray) as workers, progress() as bars:
+        settings = Settings(
+            out,
+            chosen.runs if runs is None else runs,
+            part,
+            seed,
+            None if agents is None else split_agents(agents),
+            None if variants is None else variants.split(","),
+            steps,
+            workers,
+            fresh,
+            report_only,
+            device,
+        )
         run(chosen, settings, bars, lambda line: typer.echo(line, err=True))
     typer.echo(f"written to {out}/page.md")
 

@@ -87,14 +87,14 @@ def score(
         raise ValueError(f"--worlds {worlds} is not allowed: at least 4")
     import json
 
-    from coloc_env.staging import staged_file
+    from coloc_env.staging import require_writable, staged_file
     from training.evaluation.score import score as measure
 
+    require_writable(out)
     with progress() as advance:
         found = measure(task, policy, worlds, advance)
     found |= {"label": label or policy, "link": link}
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         with staged_file(out) as file:
             file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     low, high = found["interval_95"]

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from training.cli.options import Jobs, Ray, workers_of
 from training.cli.terminal import explain, progress, show
 from training.threads import use_threads
 
@@ -40,6 +41,8 @@ def train(
     threads: Annotated[
         int, typer.Option(help="CPU threads of torch; a run that continues keeps its own.")
     ] = 1,
+    jobs: Jobs = 1,
+    ray: Ray = None,
 ) -> None:
     """Train a learned part of an agent, or continue after an interruption.
 
@@ -64,10 +67,12 @@ def train(
 
     coloc evaluate indoor-v0 --agents apf,pfnn:weights=runs/corrector/pfnn.safetensors --out results
 
+    coloc train nnhpff --out runs/detector --ray auto
+
     tensorboard --logdir runs
     """
     use_threads(threads)
-    from coloc_env.options import parse
+    from coloc_env.options import parse_all
     from training.learning import run
     from training.learning.registry import TRAININGS
 
@@ -80,8 +85,8 @@ def train(
     if resume is not None:
         if name is not None or out is not None or settings:
             raise ValueError("--resume goes alone: a run continues as it was started")
-        with progress() as bars:
-            weights = run.resume(resume, bars)
+        with workers_of(jobs, ray) as workers, progress() as bars:
+            weights = run.resume(resume, bars, workers)
     elif name is None:
         show(["training", ""], [[key, TRAININGS.summary(key)] for key in TRAININGS])
         typer.echo("coloc train TRAINING lists its options.")
@@ -93,7 +98,7 @@ def train(
         return
     else:
         known = TRAININGS.options_of(name)
-        chosen |= dict(parse(name, text, known) for text in settings or ())
-        with progress() as bars:
-            weights = run.start(name, chosen, out, bars)
+        chosen |= parse_all(name, settings or (), known)
+        with workers_of(jobs, ray) as workers, progress() as bars:
+            weights = run.start(name, chosen, out, bars, workers)
     typer.echo(f"weights written to {weights}")

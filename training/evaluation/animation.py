@@ -19,11 +19,12 @@ def frames(
     steps: int,
     every: int,
     progress: Callable[[int], None],
+    device: str | torch.device = "cpu",
 ) -> Iterator[NDArray[np.uint8]]:
     """Pictures [H, W, 3] of a run's first ``steps`` steps, of every ``every``-th one;
-    ``progress(steps_done)`` is called as steps are done."""
+    ``progress(steps_done)`` is called as steps are done. The localizer is on ``device``."""
     renderer = Renderer(scenario)
-    for step in rollout(localizer, scenario, torch.tensor([seed]), steps):
+    for step in rollout(localizer, scenario, torch.tensor([seed]), steps, device=device):
         renderer.record(step.world, step.action)
         if (step.k + 1) % every == 0:
             picture = renderer.render(step.world, "rgb_array")

@@ -2,21 +2,23 @@
 
 import statistics
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 
 from agents.localizer import Localizer
-from agents.registry import make
-from coloc_env.bounds import Bound, posterior_bound
+from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from coloc_env.seeding import checked_seed
 from coloc_env.world import World
+from training.evaluation.blocks import Block, Bounded, Team
 from training.evaluation.innovations import innovations, tracked
-from training.evaluation.record import RunRecord, record
+from training.evaluation.record import RunRecord
 from training.evaluation.results import Evaluation
 from training.evaluation.rollout import NUMERICAL, Breakdown, rollout
+from training.pool import ALONE, Workers, work
 
 Progress = Callable[[str, int, int], None]
 
@@ -39,13 +41,17 @@ def evaluate(
     *,
     bound: bool = True,
     chunk: int | None = None,
+    workers: Workers = ALONE,
+    device: str = "cpu",
 ) -> Evaluation:
     """Run agents (names with options, ``"ekf:robust=huber"``) on the worlds of seeds ``seed`` …
     ``seed + runs − 1``.
 
     ``progress(what, done, total)`` is called as work is done. ``bound``: compute the posterior
     bound too, where the scenario has one. ``chunk``: runs simulated at once (default: as many as
-    are fast); no result depends on it, a localizer's own rounding aside.
+    are fast); no result depends on it, a localizer's own rounding aside. ``workers``: who computes;
+    no digit of a result depends on that, times a step aside, which are measured here
+    at the end. ``device``: where worlds, filters and networks are.
 
     A run in which an agent's estimate is NaN or infinite, or that raises a numerical error, goes on
     with the last finite estimates (the prior before the first) and counts as diverged. An agent
@@ -53,27 +59,56 @@ def evaluate(
     first one's error is raised.
     """
     _check(agents, runs, seed, chunk)
-    team = {name: make(name, scenario) for name in agents}
+    teams = {name: Team(name, scenario, device) for name in agents}
+    localizers = {name: team.localizer for name, team in teams.items()}
     truthful = tracked(scenario)
-    known = _bound(scenario, runs, seed, progress) if bound and truthful else None
-    records: dict[str, RunRecord] = {}
+    units: list[Block | Bounded] = [Bounded(scenario, seed, runs)] if bound and truthful else []
     errors: dict[str, Exception] = {}
-    for name, localizer in team.items():
+    for name, team in teams.items():
         try:
-            found = _runs(name, localizer, scenario, runs, seed, chunk, progress)
-            records[name] = replace(found, ms_per_step=ms_per_step(localizer, scenario, seed))
+            units += _blocks(team, seed, runs, chunk)
+        except Exception as error:
+            errors[name] = error
+    known: Bound | None = None
+    parts: dict[str, dict[int, RunRecord]] = {name: {} for name in agents}
+    for found in work(units, workers, _bars(runs * scenario.horizon, progress)):
+        unit = found.unit
+        if isinstance(unit, Bounded):
+            known = found.result
+            if found.error is not None:
+                _accept_no_bound(scenario, found.error)
+        elif found.error is None:
+            parts[unit.team.name][unit.seed] = found.result
+        else:
+            errors.setdefault(unit.team.name, found.error)
+    records: dict[str, RunRecord] = {}
+    for name in agents:
+        if name in errors:
+            continue
+        try:
+            whole = RunRecord.cat([part for _, part in sorted(parts[name].items())])
+            ms = ms_per_step(localizers[name], scenario, seed, device)
+            records[name] = replace(whole, ms_per_step=ms)
         except Exception as error:
             errors[name] = error
     if not records:
-        raise next(iter(errors.values()))
+        raise errors[agents[0]]
     seeds = torch.arange(seed, seed + runs)
-    without_truth = {} if truthful else {n: innovations(team[n], scenario, seeds) for n in records}
+    without_truth = (
+        {}
+        if truthful
+        else {n: innovations(localizers[n], scenario, seeds, device) for n in records}
+    )
     return Evaluation(
         scenario,
         next(iter(records.values())).worlds,
         known,
         records,
-        {name: f"{type(e).__name__}: {' '.join(str(e).split())}" for name, e in errors.items()},
+        {
+            name: f"{type(errors[name]).__name__}: {' '.join(str(errors[name]).split())}"
+            for name in agents
+            if name in errors
+        },
         {name: figures for name, (figures, _) in without_truth.items()},
     )
 
@@ -105,64 +140,62 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
         raise ValueError(f"chunk={chunk} is not allowed: at least 1")
 
 
-def _bound(scenario: Scenario, runs: int, seed: int, progress: Progress) -> Bound | None:
-    """The posterior bound over the same worlds; None for a scenario that it does not cover."""
-    progress("bound", 0, 1)
-    try:
-        known = posterior_bound(scenario, runs=runs, seed=seed)
-    except NotImplementedError as error:  # a sensor that it cannot count
+def _blocks(team: Team, seed: int, runs: int, chunk: int | None) -> list[Block]:
+    """All runs of one agent, as many at once as are fast together: the same for all workers."""
+    at_once = chunk or _runs_at_once(team)
+    firsts = range(0, runs, at_once)
+    return [Block(team, seed + first, min(at_once, runs - first)) for first in firsts]
+
+
+def _bars(total: int, progress: Progress) -> Callable[[Block | Bounded, int], None]:
+    """Progress of units as progress of agents, of ``total`` steps each, and of the bound."""
+    done: Counter[str] = Counter()
+
+    def tick(unit: Block | Bounded, steps: int) -> None:
+        what, size = (unit.team.name, total) if isinstance(unit, Block) else ("bound", unit.size)
+        done[what] += steps
+        progress(what, done[what], size)
+
+    return tick
+
+
+def _accept_no_bound(scenario: Scenario, error: Exception) -> None:
+    """A scenario that the bound does not cover has none; any other error is raised."""
+    if isinstance(error, NotImplementedError):  # a sensor that it cannot count
         warnings.warn(f"{scenario.name}: no posterior bound: {error}", stacklevel=3)
-        known = None
-    except (ValueError, torch.linalg.LinAlgError):
-        known = None
-    progress("bound", 1, 1)
-    return known
-
-
-def _runs(
-    name: str,
-    localizer: Localizer,
-    scenario: Scenario,
-    runs: int,
-    seed: int,
-    chunk: int | None,
-    progress: Progress,
-) -> RunRecord:
-    """All runs of one agent, as many at once as are fast together."""
-    at_once = chunk or _runs_at_once(localizer, scenario)
-    done, total = 0, runs * scenario.horizon
-
-    def tick(steps: int) -> None:
-        nonlocal done
-        done += steps
-        progress(name, done, total)
-
-    seeds = torch.arange(seed, seed + runs)
-    return RunRecord.cat([record(localizer, scenario, part, tick) for part in seeds.split(at_once)])
+    elif not isinstance(error, ValueError | torch.linalg.LinAlgError):
+        raise error
 
 
 # ------------------------------------------------------------------ cost
 
 
-def _runs_at_once(localizer: Localizer, scenario: Scenario) -> int:
-    """How many runs are fastest together, from the size of one run's belief."""
+def _runs_at_once(team: Team) -> int:
+    """How many runs are fastest together, from the size of one run's belief: what fits the CPU's
+    caches, or half of a card's free memory."""
     try:
-        size = localizer.reset(World(scenario, window=1).reset(0)).bytes()
+        world = World(team.scenario, device=team.device, window=1)
+        size = team.localizer.reset(world.reset(0)).bytes()
     except NUMERICAL:
         return 1
-    return max(1, _FAST // (_WORKING_SET * max(1, size)))
+    on_card = world.device.type == "cuda" and torch.cuda.is_available()
+    fast = torch.cuda.mem_get_info(world.device)[0] // 2 if on_card else _FAST
+    return max(1, fast // (_WORKING_SET * max(1, size)))
 
 
-def ms_per_step(localizer: Localizer, scenario: Scenario, seed: int) -> float | None:
-    """Median time in ms of the whole team's step, one world, one thread; None if it raises."""
+def ms_per_step(
+    localizer: Localizer, scenario: Scenario, seed: int, device: str | torch.device = "cpu"
+) -> float | None:
+    """Median time in ms of the whole team's step, one world, one thread, on the ``device`` that the
+    localizer is on; None if it raises."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     times: list[float] = []
-    seeds = torch.tensor([seed])
+    given = (localizer, scenario, torch.tensor([seed]))
     try:
         while len(times) < _WARM_UP + _TIMED:
             steps = min(scenario.horizon, _WARM_UP + _TIMED - len(times))
-            times += [step.seconds for step in rollout(localizer, scenario, seeds, steps)]
+            times += [step.seconds for step in rollout(*given, steps, device=device, timed=True)]
     except Breakdown:
         return None
     finally:

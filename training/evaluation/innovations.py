@@ -75,7 +75,7 @@ def tracked(scenario: Scenario) -> bool:
 
 
 def innovations(
-    localizer: Localizer, scenario: Scenario, seeds: Tensor
+    localizer: Localizer, scenario: Scenario, seeds: Tensor, device: str | torch.device = "cpu"
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Figures of a localizer without truth, flat by name, and the sensors that they are of.
 
@@ -108,7 +108,7 @@ def innovations(
             sums[name].add(squared, scaled, there)
 
     try:
-        for step in rollout(localizer, scenario, seeds):
+        for step in rollout(localizer, scenario, seeds, device=device):
             if gaussian and step.k >= _STEPS:
                 look(step)
             if gaussian:

@@ -75,7 +75,8 @@ class RunRecord:
     infinity or a numerical error; ``messages`` of such errors, one a run that raised one;
     ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
     run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1, one thread;
-    ``covariance`` [K, N, d, d] (m²) of the positions in the first run (None where it was not kept).
+    ``covariance`` [K, N, d, d] (m²) of the positions in the first run, and ``attitude`` [K, N, a]
+    (None where it was not kept, or is not estimated).
     """
 
     worlds: Worlds
@@ -87,6 +88,7 @@ class RunRecord:
     series: dict[str, Floats] = field(default_factory=dict)
     ms_per_step: float | None = None
     covariance: Floats | None = None
+    attitude: Floats | None = None
 
     def to_arrays(self) -> tuple[Arrays, Facts]:
         """The agent's own arrays, and facts that JSON can hold; the worlds are not among them."""
@@ -143,6 +145,7 @@ class RunRecord:
             },
             parts[0].ms_per_step,
             parts[0].covariance,
+            parts[0].attitude,
         )
 
 
@@ -151,20 +154,24 @@ def record(
     scenario: Scenario,
     seeds: Tensor,
     progress: Callable[[int], None] = lambda steps: None,
+    device: str | torch.device = "cpu",
 ) -> RunRecord:
     """The runs of some consecutive seeds, in one batch as long as the localizer raises nothing.
 
     Where it does, the batch is halved until it is known whose run it is; that run goes on with its
-    last estimates. ``progress(run_steps)`` is called as steps are done.
+    last estimates. ``progress(run_steps)`` is called as steps are done. On another ``device`` than
+    the CPU, where the localizer must be, nothing is copied back before the end.
     """
     try:
-        return _recorded(localizer, scenario, seeds, progress, None)
+        return _recorded(localizer, scenario, seeds, progress, None, device)
     except Breakdown as breakdown:
         progress(-breakdown.k * len(seeds))
         if len(seeds) > 1:
             halves = seeds.tensor_split(2)
-            return RunRecord.cat([record(localizer, scenario, half, progress) for half in halves])
-        found = _recorded(localizer, scenario, seeds, progress, breakdown.k)
+            return RunRecord.cat(
+                [record(localizer, scenario, half, progress, device) for half in halves]
+            )
+        found = _recorded(localizer, scenario, seeds, progress, breakdown.k, device)
         return replace(found, broken=np.ones(1, bool), messages=(str(breakdown),))
 
 
@@ -174,18 +181,24 @@ def _recorded(
     seeds: Tensor,
     progress: Callable[[int], None],
     stop: int | None,
+    device: str | torch.device,
 ) -> RunRecord:
     """A batch of runs; from step ``stop`` on the last estimates stand."""
+
+    def blank(*size: int, dtype: torch.dtype = torch.float32, value: float = 0.0) -> Tensor:
+        return torch.full(size, value, dtype=dtype, device=device)
+
     dim, shape = scenario.arena.dim, (len(seeds), scenario.horizon, scenario.arena.n_uavs)
-    truth = torch.zeros(*shape, dim, dtype=torch.float64)
-    attitude = torch.zeros(*shape[1:], 4 if dim == 3 else 1, dtype=torch.float64)
-    offset, error = torch.zeros(*shape, dim), torch.zeros(shape)
-    consistency = torch.full(shape, torch.nan)
-    scored, broken = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape[0], dtype=torch.bool)
-    covariance = torch.full((*shape[1:], dim, dim), torch.nan)
-    links = torch.zeros(*shape[1:], shape[2], dtype=torch.bool)
+    truth = blank(*shape, dim, dtype=torch.float64)
+    attitude = blank(*shape[1:], 4 if dim == 3 else 1, dtype=torch.float64)
+    offset, error = blank(*shape, dim), blank(*shape)
+    consistency = blank(*shape, value=torch.nan)
+    scored, broken = blank(*shape, dtype=torch.bool), blank(shape[0], dtype=torch.bool)
+    covariance = blank(*shape[1:], dim, dim, value=torch.nan)
+    turned: list[Tensor] = []
+    links = blank(*shape[1:], shape[2], dtype=torch.bool)
     series: dict[str, Tensor] = {}
-    for step in rollout(localizer, scenario, seeds, stop=stop):
+    for step in rollout(localizer, scenario, seeds, stop=stop, device=device):
         k, world = step.k, step.world
         links[k] = step.world.links(0)
         truth[:, k], attitude[k] = world.truth.position, world.truth.attitude[0]
@@ -195,26 +208,30 @@ def _recorded(
         broken |= (~step.finite & world.alive).any(-1)
         if step.estimate is not None:
             covariance[k] = step.estimate.covariance[0]
+            now = localizer.attitude(step.belief[:1])
+            turned += [] if now is None else [now[0].double()]
             consistency[:, k] = nees(apart, step.estimate.covariance.double()).to(torch.float32)
             for name, value in _own_figures(localizer, step).items():
-                blank = torch.full(shape, torch.nan)
-                series.setdefault(name, blank)[:, k] = value.to(torch.float32)
+                if name not in series:
+                    series[name] = blank(*shape, value=torch.nan)
+                series[name][:, k] = value.to(torch.float32)
         progress(len(seeds))
     return RunRecord(
         Worlds(
             int(seeds[0]),
-            truth.numpy(),
-            attitude.numpy(),
-            scored.numpy(),
-            links.numpy(),
+            truth.cpu().numpy(),
+            attitude.cpu().numpy(),
+            scored.cpu().numpy(),
+            links.cpu().numpy(),
             places_of(step.world),
         ),
-        offset.numpy(),
-        error.numpy(),
-        consistency.numpy(),
-        broken.numpy(),
-        series={name: values.numpy() for name, values in series.items()},
-        covariance=covariance.numpy(),
+        offset.cpu().numpy(),
+        error.cpu().numpy(),
+        consistency.cpu().numpy(),
+        broken.cpu().numpy(),
+        series={name: values.cpu().numpy() for name, values in series.items()},
+        covariance=covariance.cpu().numpy(),
+        attitude=torch.stack(turned).cpu().numpy() if len(turned) == scenario.horizon else None,
     )
 
 
@@ -223,7 +240,7 @@ def places_of(world: World) -> dict[str, Floats]:
     dim, static = world.scenario.arena.dim, world.static
     maps = {"landmarks": "landmark_map", "anchors": "anchor_map"}
     return {
-        name: static[leaf][0, 0].reshape(-1, dim).numpy()
+        name: static[leaf][0, 0].reshape(-1, dim).cpu().numpy()
         for name, leaf in maps.items()
         if leaf in static
     }

@@ -14,6 +14,7 @@ from agents.localizer import Estimate, Localizer, finite_action
 from coloc_env.observation import Observation, prior_action
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
+from training.devices import clock
 
 NUMERICAL = (ArithmeticError, RuntimeError, np.linalg.LinAlgError)  # how a filter may break down
 
@@ -47,18 +48,23 @@ class Step:
 
 @torch.no_grad()
 def rollout(
-    localizer: Localizer,
+    localizer: Localizer | None,
     scenario: Scenario,
     seeds: Int64[Tensor, "B"],
     steps: int | None = None,
     stop: int | None = None,
+    device: str | torch.device = "cpu",
+    timed: bool = False,
 ) -> Iterator[Step]:
     """A localizer's steps in the worlds of ``seeds``: ``steps`` of them (default: the horizon).
+    Without one nobody estimates, and the action is what the prior says.
 
     The world moves on when the next step is asked for. From step ``stop`` on the localizer is not
-    asked any more, and its last action stands. Raises Breakdown for a numerical error.
+    asked any more, and its last action stands. Worlds are on ``device``, where the localizer must
+    be (``localizer.to``); ``timed``: wait for the device, so that ``seconds`` are those of the
+    step. Raises Breakdown for a numerical error.
     """
-    world = World(scenario, len(seeds))
+    world = World(scenario, len(seeds), device)
     observation = world.reset(seeds)
     action = prior_action(observation, scenario.arena.dim)
     belief, estimate = None, None
@@ -66,12 +72,12 @@ def rollout(
     horizon = scenario.horizon if steps is None else steps
     for k in range(horizon):
         seconds = 0.0
-        if stop is None or k < stop:
+        if localizer is not None and (stop is None or k < stop):
             try:
                 belief = localizer.reset(observation) if k == 0 else belief
-                start = time.perf_counter()
+                start = clock(world.device) if timed else time.perf_counter()
                 belief, estimate = localizer.step(belief, observation)
-                seconds = time.perf_counter() - start
+                seconds = (clock(world.device) if timed else time.perf_counter()) - start
             except NotImplementedError:
                 raise
             except NUMERICAL as error:

@@ -39,7 +39,8 @@ class EpochCollector:
     ``make(epoch)`` makes that epoch's collector from the epoch's index alone, so that an epoch is
     the same whether or not those before it were run by this process: what makes resuming exact.
     ``epoch`` is the one that runs; ``on_epoch_end(epochs)`` is called with the number of finished
-    epochs when the last batch of one has been trained on and logged.
+    epochs when the last batch of one has been trained on and logged; ``prepare`` is given an
+    epoch's batches before any of them is made.
     """
 
     init_random_frames = 0  # which the Trainer asks for
@@ -49,10 +50,11 @@ class EpochCollector:
         self.epochs = epochs
         self.epoch = 0
         self.on_epoch_end: Callable[[int], None] = lambda epochs: None
+        self.prepare: Callable[[Batches], Batches] = lambda batches: batches
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.epoch < self.epochs:
-            collector = self.make(self.epoch)
+            collector = self.prepare(self.make(self.epoch))
             yield from collector
             collector.shutdown()
             self.epoch += 1

@@ -17,7 +17,6 @@ from agents.models.process import make_process
 from agents.particle.failure import FailureDetector, evidence, network_features
 from agents.policies.adapters import LocalizerPolicy
 from agents.weights import untrained
-from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
@@ -25,15 +24,14 @@ from coloc_env.scenarios import parse_scenario
 from coloc_env.sensors import AnchorRanging
 from training.evaluation.record import record
 from training.learning.collectors import (
-    Concatenated,
     EpochCollector,
     Epochs,
     ScoreRuns,
     Seed,
     Worlds,
-    episode_collector,
     world_seed,
 )
+from training.learning.episodes import Episode, Episodes
 from training.learning.replay_buffer import replay_buffer_trainer
 from training.learning.run import Progress, Training
 
@@ -126,7 +124,7 @@ def nnhpff(
     and high process noise, range noise and number of particles. ``score_runs``: held-out worlds in
     which pf, hpff and nnhpff are compared at the end.
     """
-    scenarios = [parse_scenario(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
+    scenarios = [parse_scenario(scenario, one) for one in variants.split("/")]
     kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenarios}
     if len(kinds) > 1:
         raise ValueError(
@@ -140,13 +138,14 @@ def nnhpff(
     ]
     detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed), kinds
 
-    def collect(epoch: int) -> Concatenated:
+    def collect(epoch: int) -> Episodes:
         first = world_seed(seed, epoch, worlds * len(filters))
-        collectors = []
-        for i, (policy, one) in enumerate(filters):
-            env = CoLocEnv(one, worlds, seed=first + i * worlds)
-            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
-        return Concatenated(collectors)
+        return Episodes(
+            [
+                Episode(one, worlds, first + i * worlds, policy)
+                for i, (policy, one) in enumerate(filters)
+            ]
+        )
 
     collector = EpochCollector(collect, epochs)
     loss = DetectorLoss(detector)
@@ -191,7 +190,7 @@ def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
     for case in (1, 2, 3):
-        scenario = parse_scenario(f"{base}:case={case}")
+        scenario = parse_scenario(base, f"case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
             options: dict[str, Any] = {} if name == "pf" else {"bank": False}

@@ -22,15 +22,15 @@ from torchrl.objectives import LossModule
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from agents.weights import SUFFIX, Learned, card_of, shipped, write
-from coloc_env import options
+from coloc_env import options, state_file
 from coloc_env.json_files import read_json
-from coloc_env.options import Quantity
+from coloc_env.options import Quantity, typed
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
-from training.evaluation.tables import typed
-from training.learning import curves, state
+from training.learning import curves
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
 from training.learning.registry import TRAININGS
+from training.pool import ALONE, Workers
 from training.threads import use_threads
 
 Progress = Callable[[str, int, int], None]
@@ -118,12 +118,19 @@ def make_trainer(
     )
 
 
-def start(name: str, chosen: Mapping[str, Any], out: Path, progress: Progress) -> Path:
-    """Train from the beginning, in the folder ``out``; returns the weights' file. Raises ValueError
-    for options that do not fit, or a folder in use, before anything is written."""
+def start(
+    name: str,
+    chosen: Mapping[str, Any],
+    out: Path,
+    progress: Progress,
+    workers: Workers = ALONE,
+) -> Path:
+    """Train from the beginning, in the folder ``out``; returns the weights' file. Rollouts are
+    spread over ``workers``. Raises ValueError for options that do not fit, a training that workers
+    cannot share, or a folder in use, before anything is written."""
     chosen = options.checked(name, chosen, TRAININGS.options_of(name))
     _require_new(out)
-    training = _built(name, chosen)
+    training = _spread(name, _built(name, chosen), workers)
     config = {
         "training": name,
         "options": dict(chosen),
@@ -161,7 +168,7 @@ def _recipe(source: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]
     return config["training"], config["options"]
 
 
-def resume(folder: Path, progress: Progress) -> Path:
+def resume(folder: Path, progress: Progress, workers: Workers = ALONE) -> Path:
     """Continue the run in a folder to the weights that it would have had if it had never stopped;
     returns their file."""
     config = _config(folder)
@@ -171,7 +178,9 @@ def resume(folder: Path, progress: Progress) -> Path:
     with _alone(folder):
         remove_leftovers(folder)
         use_threads(config["threads"], f"{folder / _CONFIG}: threads")
-        return _train(folder, config, _built(config["training"], config["options"]), progress)
+        name = config["training"]
+        training = _spread(name, _built(name, config["options"]), workers)
+        return _train(folder, config, training, progress)
 
 
 def _train(folder: Path, config: Mapping[str, Any], training: Training, progress: Progress) -> Path:
@@ -185,7 +194,7 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
 
     def save(epochs: int) -> None:
         logger.sync()
-        state.save(file, {"run": _identity(config), "trainer": trainer.state_dict()})
+        state_file.save(file, {"run": _identity(config), "trainer": trainer.state_dict()})
         progress(name, epochs, collector.epochs)
 
     collector.on_epoch_end = save
@@ -217,6 +226,16 @@ def _built(name: str, chosen: Mapping[str, Any]) -> Training:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise
         raise ValueError(f"{name}: these options need more memory than there is") from None
+    return training
+
+
+def _spread(name: str, training: Training, workers: Workers) -> Training:
+    """The training, its rollouts on workers; ValueError if they cannot be spread."""
+    if workers == ALONE:
+        return training
+    from training.learning.episodes import spread
+
+    spread(name, training.collector, workers)
     return training
 
 
@@ -257,7 +276,7 @@ def _identity(config: Mapping[str, Any]) -> str:
 
 def _restore(file: Path, config: Mapping[str, Any], trainer: TrainerLike) -> None:
     """Put a state into a trainer; ValueError if it is another run's."""
-    found = state.load(file)
+    found = state_file.load(file)
     if found.get("run") != _identity(config):
         raise ValueError(
             f"{file} is the state of {found.get('run')}, {_CONFIG} describes {_identity(config)}"

@@ -4,17 +4,12 @@ All agents take each step in turn, so that whatever else the machine does slows 
 their times can be compared pair by pair.
 """
 
-import json
-import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-from torch.profiler import ProfilerActivity, profile
 
 from agents.localizer import Localizer
 from agents.registry import make
@@ -22,6 +17,7 @@ from coloc_env.scenario import Scenario
 from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Floats
 from training.evaluation.rollout import Breakdown, rollout
+from training.memory import peak_bytes
 from training.reproduce.store import Arrays, Facts
 from training.reproduce.work import Kind, Piece, Variant
 
@@ -84,7 +80,7 @@ def measure(
                     ms[name].append(spent)
             progress("cost", k + 1, warm_up + scenario.horizon)
         return {
-            name: Cost(np.array(ms[name]), team.last.belief.bytes(), _peak(team))
+            name: Cost(np.array(ms[name]), team.last.belief.bytes(), team.peak())
             for name, team in teams.items()
         }
 
@@ -118,32 +114,10 @@ class _Team:
         self.last = next(self._steps)
         return 1e3 * self.last.seconds
 
-
-def _peak(team: _Team) -> int:
-    """Bytes allocated at the height of a step, as torch's profiler counts them."""
-    with tempfile.TemporaryDirectory() as folder, _silenced():
-        with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
-            team.localizer.step(team.last.belief, team.last.observation)
-        trace = Path(folder) / "trace.json"
-        profiler.export_chrome_trace(str(trace))
-        events = json.loads(trace.read_text())["traceEvents"]
-    changes = [e for e in events if e.get("name") == "[memory]"]
-    changes.sort(key=lambda event: event["ts"])
-    held = np.cumsum([0, *(event["args"]["Bytes"] for event in changes)])
-    return int(held.max())
-
-
-@contextmanager
-def _silenced() -> Iterator[None]:
-    """The profiler writes about itself to stderr, past Python: not here."""
-    kept = os.dup(2)
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+    def peak(self) -> int:
+        """Bytes allocated at the height of the last step."""
+        last = self.last
+        return peak_bytes(lambda: self.localizer.step(last.belief, last.observation))
 
 
 @contextmanager

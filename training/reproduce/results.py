@@ -107,7 +107,13 @@ class Results:
     def _blocks(self, variant: Variant, agent: str, runs: int) -> list[Piece]:
         ends = [end for end in self._ends[variant.key] if end <= runs]
         return [
-            Piece(variant, (agent,), self.settings.seed + start, end - start)
+            Piece(
+                variant,
+                (agent,),
+                self.settings.seed + start,
+                end - start,
+                device=self.settings.device,
+            )
             for start, end in zip((0, *ends), ends, strict=False)
         ]
 

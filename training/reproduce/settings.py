@@ -5,14 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coloc_env.seeding import checked_seed
+from training.pool import ALONE, Workers
 
 
 @dataclass(frozen=True)
 class Settings:
     """``out``: folder of the store and the results; ``part`` of the study, or "all"; ``runs``:
     worlds of the main tables, seeded ``seed``, ``seed`` + 1, …; ``agents`` and ``variants``: these
-    only (None: all); ``steps``: cut runs to so many (None: whole runs); ``jobs``: processes at
-    once; ``fresh``: throw the store away first; ``report_only``: compute nothing.
+    only (None: all); ``steps``: cut runs to so many (None: whole runs); ``workers``: who
+    computes; ``fresh``: throw the store away first; ``report_only``: compute nothing;
+    ``device``: where runs are.
 
     Links in ``out`` are followed. Raises ValueError, in one line, for a value that is not allowed.
     """
@@ -24,12 +26,13 @@ class Settings:
     agents: Sequence[str] | None = None
     variants: Sequence[str] | None = None
     steps: int | None = None
-    jobs: int = 1
+    workers: Workers = ALONE
     fresh: bool = False
     report_only: bool = False
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for name in ("runs", "steps", "jobs"):
+        for name in ("runs", "steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"--{name} {value} is not allowed: at least 1")

@@ -17,16 +17,17 @@ from agents.registry import LOCALIZERS
 from coloc_env.options import require_known
 from coloc_env.registry import Registry
 from coloc_env.staging import staged_folder
+from training import pool
 from training.evaluation.evaluate import Progress, silent
 from training.evaluation.results import plain
-from training.reproduce import page, pool, verdicts
+from training.reproduce import page, verdicts
 from training.reproduce.cost import COST, Cost
 from training.reproduce.drawing import Drawing, draw
 from training.reproduce.results import Results
 from training.reproduce.settings import Settings
 from training.reproduce.tables import Table
 from training.reproduce.verdicts import Claim, Goal
-from training.reproduce.work import Cell, Piece, Training, Unit
+from training.reproduce.work import Cell, Piece, Training, TrainingRun, Unit
 
 STUDIES = Registry(
     "study",
@@ -110,8 +111,9 @@ def reproduce(
         if results.store.empty():
             raise ValueError(f"{settings.store} holds nothing yet: run without --report-only first")
     else:
-        _run([one for one in trainings if not one.done(settings.out)], "trainings", settings,
-             progress, report)  # fmt: skip
+        left = [one for one in trainings if not one.done(settings.out)]
+        runs = [TrainingRun(one, one.folder(settings.out)) for one in left]
+        _run(runs, "trainings", settings, progress, report)
     pieces = [piece for piece in results.pieces() if not piece.done(settings.out)]
     if settings.report_only:
         _note(results, [(piece, "not run") for piece in pieces])
@@ -122,7 +124,7 @@ def reproduce(
             report(f"{subject}: {why}")
         _note(results, _run(others, "simulations", settings, progress, report))
         for piece in timed:  # alone on the machine
-            piece.run(settings.out, lambda steps: None)
+            piece.keep(settings.out, piece.run(lambda steps: None))
             report(f"timed {piece.variant.key}")
     with staged_folder(settings.out, study.files) as folder:
         page.write(_content(study, parts, results, folder), folder, FILES)
@@ -167,17 +169,24 @@ def _run(
     """Run units of work; those that failed, with the reason."""
     total, done, start = sum(unit.size for unit in units), 0, time.monotonic()
 
-    def counted(size: int) -> None:
+    def counted(_: Unit, size: int) -> None:
         nonlocal done
         done += size
         progress(what, done, total)
 
     failed = []
-    for i, (unit, error) in enumerate(pool.work(units, settings.out, settings.jobs, counted), 1):
+    for i, found in enumerate(pool.work(units, settings.workers, counted), 1):
+        unit, error = found.unit, found.error
         line = f"{i}/{len(units)} {unit.name}"
+        if error is None:
+            try:
+                unit.keep(settings.out, found.result)
+            except OSError as unwritten:
+                error = unwritten
         if error is not None:
-            failed.append((unit, error))
-            line += f" failed: {error}"
+            why = f"{type(error).__name__}: {error}"
+            failed.append((unit, why))
+            line += f" failed: {why}"
         report(f"{line} ({time.monotonic() - start:.0f} s)")
     return failed
 

@@ -17,7 +17,7 @@ from coloc_env.bounds import Bound, SnapshotBound, posterior_bound, snapshot_bou
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from training.evaluation.evaluate import Progress, evaluate, silent
-from training.reproduce.identity import code_of, weights_of
+from training.identity import code_of, weights_of
 from training.reproduce.store import Arrays, Facts, Store
 
 WORLD = "dead_reckoning"  # run with the bound, for the worlds' truth: it applies to all of them
@@ -80,13 +80,14 @@ class Cell:
 @dataclass(frozen=True)
 class Piece:
     """A unit of work: agents in the worlds of ``runs`` seeds from ``seed`` on; no agents: the
-    worlds themselves (bounds)."""
+    worlds themselves (bounds). ``device``: where simulated runs are; kinds are on the CPU."""
 
     variant: Variant
     agents: tuple[str, ...]
     seed: int
     runs: int
     kind: Kind | None = None
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -113,8 +114,8 @@ class Piece:
         """Whether it is stored under an output folder."""
         return _store(out).has(self.name, self.settings())
 
-    def run(self, out: Path, progress: Callable[[int], None]) -> None:
-        """Compute and store it, on one thread; ``progress`` is given steps as they are done."""
+    def run(self, progress: Callable[[int], None]) -> tuple[Arrays, Facts]:
+        """Compute it, on one thread; ``progress`` is given steps as they are done."""
         torch.set_num_threads(1)
         before = 0
 
@@ -124,9 +125,14 @@ class Piece:
                 progress(done - before)
                 before = done
 
-        arrays, facts = resolve(self.kind.compute if self.kind else _RUN)(self, steps_done)
-        _store(out).save(self.name, self.settings(), arrays, facts)
+        compute = resolve(self.kind.compute if self.kind else _RUN)
+        found: tuple[Arrays, Facts] = compute(self, steps_done)
         progress(self.size - before)
+        return found
+
+    def keep(self, out: Path, found: tuple[Arrays, Facts]) -> None:
+        """Store what ``run`` returned under an output folder."""
+        _store(out).save(self.name, self.settings(), *found)
 
     def load(self, store: Store) -> tuple[Arrays, Facts]:
         """What was stored."""
@@ -141,38 +147,52 @@ class Training:
     key: str
     training: str
     options: tuple[tuple[str, Any], ...] = ()
-    size: int = 1
-
-    @property
-    def name(self) -> str:
-        return f"training {self.key}"
 
     def folder(self, out: Path) -> Path:
         """Its run's folder."""
         return (out / "runs" / self.key).absolute()
 
-    def settings(self) -> dict[str, Any]:
-        """What decides the run, as it is to be in a worker."""
-        return {"training": self.training, "options": dict(self.options)}
-
     def done(self, out: Path) -> bool:
         """Whether the weights are there."""
         return (self.folder(out) / f"{self.training}.json").exists()
 
-    def run(self, out: Path, progress: Callable[[int], None]) -> None:
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """A training as a unit of work, in ``folder``, which every worker must see."""
+
+    training: Training
+    folder: Path
+    size: int = 1
+
+    @property
+    def name(self) -> str:
+        return f"training {self.training.key}"
+
+    def settings(self) -> dict[str, Any]:
+        """What decides the run, as it is to be in a worker."""
+        one = self.training
+        return {"training": one.training, "options": dict(one.options), "folder": str(self.folder)}
+
+    def run(self, progress: Callable[[int], None]) -> None:
         """Train, or go on where it stopped, on one thread."""
         from training.learning import run as trainings
 
         torch.set_num_threads(1)
-        folder = self.folder(out)
-        if (folder / "run.json").exists():
-            trainings.resume(folder, silent)
+        if (self.folder / "run.json").exists():
+            trainings.resume(self.folder, silent)
         else:
-            trainings.start(self.training, dict(self.options), folder, silent)
+            options = dict(self.training.options)
+            trainings.start(self.training.training, options, self.folder, silent)
         progress(self.size)
 
+    def keep(self, out: Path, found: None) -> None:
+        """OSError unless the weights that a worker wrote are here."""
+        if not self.training.done(out):
+            raise OSError(f"{self.folder} is not on a file system that all workers share")
 
-Unit = Piece | Training
+
+Unit = Piece | TrainingRun
 
 
 def resolve(reference: str) -> Callable[..., Any]:
@@ -203,6 +223,7 @@ def _settings(piece: Piece) -> dict[str, Any]:
         "weights": [weights_of(localizer) for localizer in localizers],
         "code": code_of(piece.variant.scenario, localizers, modules),
         "torch": str(torch.__version__),
+        **({} if piece.device == "cpu" else {"device": piece.device}),
     }
 
 
@@ -218,7 +239,8 @@ def run_agent(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
     scenario, (agent,) = piece.variant.build(), piece.agents
     of_world = agent == WORLD
     bound = of_world and piece.variant.bounded
-    found = evaluate(scenario, [agent], piece.runs, piece.seed, progress, bound=bound)
+    where = piece.device
+    found = evaluate(scenario, [agent], piece.runs, piece.seed, progress, bound=bound, device=where)
     arrays, facts = found.agents[agent].to_arrays()
     if of_world:
         arrays |= found.worlds.to_arrays()

@@ -12,7 +12,8 @@ from torch import nn
 from agents.localizer import Localizer
 from agents.registry import make
 from coloc_env.scenarios import make_scenario
-from training.reproduce import identity, work
+from training import identity
+from training.reproduce import work
 from training.reproduce.store import Store
 from training.reproduce.work import Piece, Variant
 

@@ -7,6 +7,7 @@ import pytest
 
 from coloc_env.scenarios import make_scenario
 from training.evaluation.evaluate import evaluate
+from training.pool import ALONE, Workers
 from training.reproduce import study, work
 from training.reproduce.cost import COST, measure
 from training.reproduce.drawing import panels
@@ -16,7 +17,16 @@ from training.reproduce.settings import Settings
 from training.reproduce.study import STUDIES, Part, Study, reproduce
 from training.reproduce.tables import by_agent, with_ends
 from training.reproduce.verdicts import Claim, Goal, mean_of
-from training.reproduce.work import POSTERIOR, SNAPSHOT, WORLD, Cell, Piece, Training, Variant
+from training.reproduce.work import (
+    POSTERIOR,
+    SNAPSHOT,
+    WORLD,
+    Cell,
+    Piece,
+    Training,
+    TrainingRun,
+    Variant,
+)
 
 SMALL = Variant("small", "small", (("n_uavs", 2),), steps=12)
 OTHER = Variant("other", "other", (("n_uavs", 2), ("nlos", 0.3)), steps=12)
@@ -53,10 +63,12 @@ def results_of(out: Path, *cells: Cell, seed: int = 5) -> Results:
     return Results(Settings(out, 5, seed=seed), cells, cells)
 
 
-def run(out: Path, *cells: Cell, seed: int = 5, jobs: int = 1) -> tuple[Results, list[str]]:
+def run(
+    out: Path, *cells: Cell, seed: int = 5, workers: Workers = ALONE
+) -> tuple[Results, list[str]]:
     """Everything run; the results, and what was reported."""
     lines: list[str] = []
-    reproduce(small(*cells), Settings(out, 5, seed=seed, jobs=jobs), silent, lines.append)
+    reproduce(small(*cells), Settings(out, 5, seed=seed, workers=workers), silent, lines.append)
     found = results_of(out, *cells, seed=seed)
     found.pieces()
     return found, lines
@@ -131,10 +143,10 @@ def test_an_interruption_keeps_what_is_done(
 ) -> None:
     compute = work.Piece.run
 
-    def interrupted(piece: Piece, *rest: object) -> None:
+    def interrupted(piece: Piece, *rest: object) -> object:
         if piece.agents == ("ekf",):
             raise KeyboardInterrupt
-        compute(piece, *rest)  # type: ignore[arg-type]
+        return compute(piece, *rest)  # type: ignore[arg-type]
 
     cell = Cell(SMALL, ("test_still", "ekf"), 2)
     with monkeypatch.context() as patch:
@@ -237,7 +249,7 @@ def test_bounds_are_pieces_of_a_study(tmp_path: Path) -> None:
 def test_processes_make_the_same(tmp_path: Path) -> None:
     cell = Cell(SMALL, ("ekf",), 2)
     alone, _ = run(tmp_path / "alone", cell)
-    together, lines = run(tmp_path / "together", cell, jobs=2)
+    together, lines = run(tmp_path / "together", cell, workers=Workers(2))
     assert len(lines) == 2
     for agent in (WORLD, "ekf"):
         a, b = (results["small", agent].record.offset for results in (alone, together))
@@ -285,7 +297,6 @@ def test_cost_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     [
         ({"runs": 0}, "--runs 0"),
         ({"steps": 0}, "--steps 0"),
-        ({"jobs": 0}, "--jobs 0"),
         ({"seed": -1}, "seed=-1"),
         ({"fresh": True, "report_only": True}, "nothing would be left"),
     ],
@@ -397,9 +408,12 @@ def test_trainings_are_units_of_work(tmp_path: Path) -> None:
     tiny = (("worlds", 2), ("epochs", 1), ("steps", 5), ("passes", 1), ("minibatches", 1),
             ("scenario", "indoor-v0:n_uavs=2:horizon=10"), ("score_runs", 0))  # fmt: skip
     one, bad = Training("a-0", "mappo", tiny), Training("b-0", "mappo", (("worlds", 0),))
-    outcome = dict(study.pool.work([one, bad], tmp_path, 1, silent))
-    assert outcome[one] is None
-    assert outcome[bad] is not None
-    assert "worlds" in outcome[bad]
+    runs = [TrainingRun(each, each.folder(tmp_path)) for each in (one, bad)]
+    first, second = study.pool.work(runs, ALONE, silent)
+    assert first.error is None
+    first.unit.keep(tmp_path, first.result)
+    assert "worlds" in str(second.error)
+    with pytest.raises(OSError, match="share"):
+        second.unit.keep(tmp_path, None)
     assert one.done(tmp_path)
     assert not bad.done(tmp_path)

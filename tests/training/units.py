@@ -13,6 +13,7 @@ from typing import Any
 class Unit:
     """Writes a file; its process is killed the first ``kills`` times; it may raise, or wait."""
 
+    out: Path
     name: str
     kills: int = 0
     raises: bool = False
@@ -22,10 +23,11 @@ class Unit:
     def settings(self) -> dict[str, Any]:
         return {"name": self.name}
 
-    def done(self, out: Path) -> bool:
-        return (out / self.name).exists()
+    def done(self) -> bool:
+        return (self.out / self.name).exists()
 
-    def run(self, out: Path, progress: Callable[[int], None]) -> None:
+    def run(self, progress: Callable[[int], None]) -> str:
+        out = self.out
         tried = len(list(out.glob(f"{self.name}.try-*")))
         (out / f"{self.name}.try-{tried}-{os.getpid()}").touch()
         progress(4)
@@ -36,3 +38,4 @@ class Unit:
         time.sleep(self.seconds)
         progress(6)
         (out / self.name).touch()
+        return self.name

@@ -10,42 +10,58 @@ from pathlib import Path
 import pytest
 from units import Unit
 
-from training.reproduce import pool
+from training import pool
+from training.pool import Workers
 
 
 def test_dead_processes_are_replaced_and_what_always_dies_is_reported(tmp_path: Path) -> None:
-    units = [Unit("a"), Unit("once", kills=1), Unit("always", kills=9), Unit("b", raises=True)]
-    units += [Unit(f"c{i}") for i in range(3)]
+    out = tmp_path
+    units = [Unit(out, "a"), Unit(out, "once", kills=1), Unit(out, "always", kills=9)]
+    units += [Unit(out, "b", raises=True)] + [Unit(out, f"c{i}") for i in range(3)]
     steps: list[int] = []
-    outcome = dict(pool.work(units, tmp_path, 2, steps.append))  # type: ignore[arg-type]
-    assert outcome.keys() == set(units)
-    failed = {unit.name: why for unit, why in outcome.items() if why is not None}  # type: ignore[union-attr]
+    found = list(pool.work(units, Workers(2), lambda _, size: steps.append(size)))
+    assert {one.unit for one in found} == set(units)
+    failed = {one.unit.name: one.error for one in found if one.error is not None}
     assert failed.keys() == {"always", "b"}
-    assert failed["always"] == "its process died 2 times (out of memory?)"
-    assert failed["b"] == "ZeroDivisionError: by nothing"
+    assert isinstance(failed["always"], pool.WorkerDied)
+    assert str(failed["always"]) == "2 times (out of memory?)"
+    assert isinstance(failed["b"], ZeroDivisionError)
+    assert str(failed["b"]) == "by nothing"
     assert len(list(tmp_path.glob("always.try-*"))) == 2
     assert sum(steps) == sum(unit.size for unit in units)
-    assert all(unit.done(tmp_path) for unit in units if unit.name not in failed)
+    assert all(one.result == one.unit.name for one in found if one.error is None)
+    assert all(unit.done() for unit in units if unit.name not in failed)
 
 
 def test_one_process_does_the_same(tmp_path: Path) -> None:
-    units = [Unit("a"), Unit("b", raises=True)]
+    units = [Unit(tmp_path, "a"), Unit(tmp_path, "b", raises=True)]
     steps: list[int] = []
-    outcome = [why for _, why in pool.work(units, tmp_path, 1, steps.append)]  # type: ignore[arg-type]
-    assert outcome == [None, "ZeroDivisionError: by nothing"]
+    first, second = pool.work(units, pool.ALONE, lambda _, size: steps.append(size))
+    assert (first.result, first.error) == ("a", None)
+    assert isinstance(second.error, ZeroDivisionError)
     assert sum(steps) == 20
 
 
+@pytest.mark.parametrize(
+    ("jobs", "ray", "why"), [(0, None, "--jobs 0"), (2, "auto", "--jobs and --ray")]
+)
+def test_workers_that_cannot_be_are_refused(jobs: int, ray: str | None, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        Workers(jobs, ray)
+
+
 _PARENT = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from units import Unit
-from training.reproduce import pool
+from training import pool
 
 if __name__ == "__main__":
-    units = [Unit(str(i), seconds=300.0) for i in range(4)]
-    list(pool.work(units, Path(sys.argv[1]), 2, lambda size: None))
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
+    units = [Unit(Path(sys.argv[1]), str(i), seconds=300.0) for i in range(4)]
+    list(pool.work(units, pool.Workers(2), lambda unit, size: None))
 """
 
 
@@ -67,12 +83,12 @@ def test_workers_end_with_their_parent(kill: signal.Signals, tmp_path: Path) -> 
     command = [sys.executable, str(script), str(out), str(Path(__file__).parent)]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 60)
+        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 300)
         workers = [int(file.name.rsplit("-", 1)[1]) for file in out.glob("*.try-*")]
         assert all(map(_running, workers))
         parent.send_signal(kill)
-        parent.wait(20)
-        _wait_for(lambda: not any(map(_running, workers)), 10)
+        parent.wait(120)
+        _wait_for(lambda: not any(map(_running, workers)), 120)
     finally:
         parent.kill()
         parent.wait()

@@ -12,12 +12,12 @@ import inspect
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import nn
 
 from agents.localizer import Localizer
+from agents.parts import parts_of
 from coloc_env.scenarios.registry import SCENARIOS
 
 _PACKAGES = ("agents", "coloc_env", "training")
@@ -31,7 +31,7 @@ def code_of(
     """Hash of the code of a scenario's family (by the scenario's id), of worlds, of localizers with
     the localizers that they are made of, and of other modules."""
     family = inspect.getsourcefile(inspect.unwrap(SCENARIOS[scenario]))
-    parts = {type(part) for one in localizers for part in _parts(one, set())}
+    parts = {type(part) for one in localizers for part in parts_of(one)}
     made_of = [part for part in parts if issubclass(part, Localizer)]
     sources = sorted(filter(None, (family, *map(inspect.getsourcefile, made_of))))
     first = [file for name in (*_WORLD, *modules) for file in _files(name)]
@@ -41,7 +41,7 @@ def code_of(
 def weights_of(localizer: Localizer) -> str | None:
     """Hash of a localizer's learned weights, wherever in its parts; None if it has none."""
     digest, some = hashlib.sha256(), False
-    for module in _parts(localizer, set()):
+    for module in parts_of(localizer):
         if not isinstance(module, nn.Module):
             continue
         for key, value in module.state_dict().items():
@@ -49,23 +49,6 @@ def weights_of(localizer: Localizer) -> str | None:
             digest.update(f"{key}{tuple(value.shape)}".encode())
             digest.update(value.detach().to("cpu", torch.float64).numpy().tobytes())
     return digest.hexdigest()[:12] if some else None
-
-
-def _parts(part: Any, seen: set[int]) -> Iterator[Any]:
-    """An object of this project, its parts, and so on; what lies inside a neural part aside."""
-    if id(part) in seen:
-        return
-    seen.add(id(part))
-    yield part
-    inside: Iterable[Any] = ()
-    if isinstance(part, list | tuple):
-        inside = part
-    elif isinstance(part, dict):
-        inside = part.values()
-    elif hasattr(part, "__dict__") and type(part).__module__.split(".")[0] == "agents":
-        inside = () if isinstance(part, nn.Module) else vars(part).values()
-    for each in inside:
-        yield from _parts(each, seen)
 
 
 @lru_cache
