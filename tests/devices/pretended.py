@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -17,8 +18,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-CARD = torch.device("cuda")
-_BELOW = torch.device("meta")  # what C++ is told: for this device it needs no driver
+CARD = torch.device("cuda:0")
+_BELOW = torch.device("meta")  # what C++ is given: this device needs no driver
 _READS = ("_local_scalar_dense", "nonzero", "equal", "is_nonzero")  # a number comes back
 _MOVES = ("_to_copy", "copy_")  # take tensors of two devices
 
@@ -199,6 +200,8 @@ def card() -> Iterator[Counter[str]]:
     """Inside, "cuda" is a device; what is read back from it is counted, by operation."""
     reads: Counter[str] = Counter()
     with ExitStack() as stack:
+        for name, value in (("current_device", 0), ("synchronize", None)):
+            stack.enter_context(patch.object(torch.cuda, name, lambda *_, value=value: value))
         stack.enter_context(_Operations(reads))
         stack.enter_context(_Calls())
         yield reads

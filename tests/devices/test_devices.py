@@ -116,7 +116,6 @@ def test_a_picture() -> None:
         ["reproduce", "cspf"],
         ["render", "indoor-v0"],
         ["bench"],
-        ["train", "ippo"],
     ],
     ids=lambda words: words[0],
 )
@@ -124,6 +123,8 @@ def test_no_card_is_said_in_a_line(words: list[str], device: str, tmp_path: Path
     out = tmp_path / ("out.png" if words[0] == "render" else "out")
     done = CliRunner().invoke(app, [*words, "--out", str(out), "--device", device])
     assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"error: --device {device} is not there: cpu available; for a GPU")
+    assert done.stderr.startswith(
+        f"error: --device {device} is not there: cpu available; for a GPU"
+    )
     assert done.stderr.count("\n") == 1
     assert not out.exists()

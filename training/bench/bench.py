@@ -26,8 +26,14 @@ from coloc_env.staging import staged_folder
 from training.bench.agents import TITLES, time_agents
 from training.bench.cases import Case, Timed, cases
 from training.bench.figures import FIGURES, draw
+from training.bench.growth import growth
+from training.bench.growth_figures import device_figure, growth_figure
 from training.bench.learning import learning_cases
+from training.bench.on_device import on_device
 from training.bench.peers import peers
+from training.bench.spread import spread
+from training.bench.study_cost import study_cost
+from training.pool import Workers
 
 T = TypeVar("T")
 NAMES = (*FIGURES, "bench.json")
@@ -61,8 +67,42 @@ def bench(out: Path, quick: bool = False, agents: bool = True) -> None:
         results = run_bench(quick, agents)
         show(results)
         draw(results, folder)
-        (folder / "bench.json").write_text(json.dumps(results, indent=1) + "\n")
+        _write(results, folder / "bench.json")
     Console().print(f"written to {out}", highlight=False)
+
+
+def bench_growth(out: Path, quick: bool, device: torch.device) -> None:
+    """Write ``growth.json``, its figure, and ``study_cost.json``, the table of a study's cost."""
+    names = ("growth.json", "growth.png", "study_cost.json")
+    with staged_folder(out, names) as folder:
+        results = growth(quick, device, _track)
+        _write(results, folder / names[0])
+        growth_figure(results).savefig(folder / names[1], dpi=110)
+        _write(study_cost(results), folder / names[2])
+    Console().print(f"written to {out}", highlight=False)
+
+
+def bench_device(out: Path, quick: bool, device: torch.device) -> None:
+    """Write ``device.json`` and its figure."""
+    with staged_folder(out, ("device.json", "device.png")) as folder, _one_thread():
+        results = on_device(quick, device, _track)
+        _write(results, folder / "device.json")
+        device_figure(results).savefig(folder / "device.png", dpi=110)
+    Console().print(f"written to {out}", highlight=False)
+
+
+def bench_spread(out: Path, quick: bool, workers: Workers) -> None:
+    """Write ``spread.json``."""
+    with staged_folder(out, ("spread.json",)) as folder, _one_thread():
+        results = spread(quick, workers)
+        _write(results, folder / "spread.json")
+    shown = ("start_s", "ms_per_cell", "alone_s", "spread_s", "speed_up")
+    lines = [(name, f"{results[name]:.3g}") for name in shown]
+    Console().print(_table(("", "measured"), lines), highlight=False)
+
+
+def _write(results: dict[str, Any], file: Path) -> None:
+    file.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:

@@ -12,12 +12,14 @@ import yaml
 from agents import make
 from agents.online import OnlineLocalizer
 from coloc_env.datasets import DataError, Recording
+from coloc_env.datasets.check import check
 from coloc_env.datasets.open_format import read_recording
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import ArrivalAngles, Height, OpticalFlow, PositionFix, Tdoa
 from coloc_env.world import World
 from tests.agents.live_events import events_of, replayed
 from tests.coloc_env.datasets.folders_made import Folder, swarm, table, write
+from training.calibration.calibrate import calibrate
 
 
 def read(home: Path, files: Folder) -> Recording:
@@ -91,6 +93,19 @@ def test_what_is_of_space_is_refused_in_the_plane(name: str, tmp_path: Path) -> 
     }
     with pytest.raises(DataError, match="for 3 dimensions"):
         read(tmp_path, files)
+
+
+def test_a_mirror_image_is_warned_of_and_no_robot_is_lost(tmp_path: Path) -> None:
+    """Three anchors in space; b hears them, a only knows in which direction he is."""
+    files = swarm()
+    del files["a/tdoa.csv"]
+    words = check(read(tmp_path / "one", files)).warnings
+    assert any("a mirror image fits as well" in text for text in words)
+    assert not any("nothing shows where" in text for text in words)
+    for name in "ab":
+        del files[f"{name}/angles.csv"]
+    words = check(read(tmp_path / "two", files)).warnings
+    assert any("nothing shows where a is" in text for text in words)
 
 
 # ---------------------------------------------------------------- a recording of a simulated team
@@ -174,6 +189,19 @@ def test_a_recorded_team_is_believed_and_localized(tmp_path: Path) -> None:
         world.advance(estimate.action())
         seen = world.observation()
     assert float(torch.stack(squared)[20:].mean().sqrt()) < 0.2
+
+
+@pytest.mark.slow
+def test_calibration_finds_the_noise(tmp_path: Path) -> None:
+    """As it was simulated: 0.15 m, 0.05 rad, 0.1 m/s."""
+    found = calibrate(read_recording(simulated(tmp_path)))
+    assert found.model.tdoa.std == pytest.approx(0.15, rel=0.1)
+    assert found.model.arrival_angles.azimuth_std == pytest.approx(0.05, rel=0.25)
+    assert found.model.arrival_angles.elevation_std == pytest.approx(0.05, rel=0.25)
+    assert found.model.flow.std == pytest.approx(0.1, rel=0.2)
+    for name in ("time differences", "azimuth", "elevation", "flow forward", "flow left"):
+        noise = found.noises[name]
+        assert abs(noise.bias) < 5 * noise.std / noise.count**0.5
 
 
 @pytest.mark.slow

@@ -1,0 +1,54 @@
+"""``coloc bench --jobs`` and ``--ray``: what it costs to spread work, and what it brings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from coloc_env.scenarios import make_scenario
+from training.bench.growth import provenance
+from training.evaluation.evaluate import evaluate
+from training.pool import ALONE, Workers, work
+
+CELLS, RUNS, CHUNK = 200, 64, 4
+
+
+@dataclass(frozen=True)
+class _Nothing:
+    """A cell that does nothing."""
+
+    number: int
+    size: int = 1
+
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def run(self, progress: Callable[[int], None]) -> None:
+        progress(1)
+
+
+def spread(quick: bool, workers: Workers) -> dict[str, Any]:
+    """``start_s`` until the first cell is done, ``ms_per_cell`` of cells that do nothing; seconds
+    of an evaluation ``alone_s`` and ``spread_s``, workers started before, and their ratio."""
+    cells = [_Nothing(i) for i in range(20 if quick else CELLS)]
+    start = time.perf_counter()
+    done = [time.perf_counter() for _ in work(cells, workers, lambda cell, size: None)]
+    scenario = make_scenario("indoor-v0", horizon=20 if quick else 200)
+    runs = 8 if quick else RUNS
+    seconds = {}
+    for name, who in (("alone", ALONE), ("spread", workers)):
+        before = time.perf_counter()
+        evaluate(scenario, ["ekf", "pf500"], runs, bound=False, chunk=CHUNK, workers=who)
+        seconds[name] = time.perf_counter() - before
+    return provenance(torch.device("cpu")) | {
+        "cells": len(cells),
+        "start_s": done[0] - start,
+        "ms_per_cell": 1e3 * (done[-1] - done[0]) / (len(cells) - 1),
+        "alone_s": seconds["alone"],
+        "spread_s": seconds["spread"],
+        "speed_up": seconds["alone"] / seconds["spread"],
+    }
