@@ -30,9 +30,9 @@ demo: $(VENV)/.installed
 		--agents dead_reckoning,ekf,ekf_trust,ekf_joint,pf800,pfnn
 	@echo "3. A picture of it."
 	$(BIN)/coloc render indoor-v0 --agent ekf --steps 150 --out $(OUT)/indoor/scene.png
-	@echo "4. Five real robots (MRCLAM)."
+	@echo "4. Five real robots: the first 2 minutes of MRCLAM."
 	@if $(BIN)/python -c "from coloc_env.datasets import sequences; exit(not sequences('mrclam'))" 2>/dev/null; \
-	then $(BIN)/coloc evaluate replay-mrclam-v0 --runs 1 --no-bound --out $(OUT)/mrclam \
+	then $(BIN)/coloc evaluate replay-mrclam-v0 --set span=0:120 --runs 1 --no-bound --out $(OUT)/mrclam \
 		--agents dead_reckoning,ekf,ekf:robust=huber,ekf_trust,ekf:robust=huber:cooperate=false; \
 	else echo "No recordings found: docs/how-to/recordings.md says where they come from."; fi
 	@echo "Tables and figures are in $(OUT)/"

@@ -21,7 +21,7 @@ from coloc_env.network import Network
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, PriorOptions
 from coloc_env.scenarios.replay import own_beliefs, own_prior, own_team
-from coloc_env.sensors import LandmarkBearings, Sensor, UavBearings
+from coloc_env.sensors import ArrivalAngles, LandmarkBearings, Sensor, Tdoa, UavBearings
 from coloc_env.sensors.base import Layout
 
 LEVEL = 1_000_000_000  # ns of an IMU that show which way is up
@@ -154,7 +154,7 @@ class LiveTeam:
 
 
 def _deeper(belief: Sensor, depth: int) -> Sensor:
-    """A belief about bearings with room for so many of one thing in a step."""
-    if isinstance(belief, LandmarkBearings | UavBearings):
+    """A belief about what may come several times in a step, with room for so many of one thing."""
+    if isinstance(belief, ArrivalAngles | LandmarkBearings | Tdoa | UavBearings):
         return replace(belief, depth=depth)
     return belief

@@ -1,5 +1,6 @@
 """A localizer fed by measurements as they come: ``OnlineLocalizer``."""
 
+import copy
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -10,17 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from agents.live_team import LiveTeam
 from agents.localizer import Estimate, finite_action
 from agents.registry import make
+from coloc_env import state_file
 from coloc_env.datasets.live import Sample
 from coloc_env.datasets.recording import DataError
 from coloc_env.observation import prior_action
-from coloc_env.staging import staged_file
 
 _JUMP = 60.0  # s: a stamp farther from the newest one is of another clock,
 _AGREE = 20  # and where so many in a row are, the team's clock was set
@@ -272,7 +271,7 @@ class OnlineLocalizer:
     # ---------------------------------------------------------------- restarts
 
     def save(self, path: str | Path) -> None:
-        """Write the belief and the samples that are still needed, as safetensors.
+        """Write the belief and the samples that are still needed, with a checksum.
 
         Raises:
             ValueError: before the first step, and for a localizer whose belief is not of tensors.
@@ -283,65 +282,47 @@ class OnlineLocalizer:
         flat = last.belief.to_tensordict().flatten_keys("/")
         if not all(isinstance(value, Tensor) for value in flat.values()):
             raise ValueError(f"{self.agent}: its belief cannot be saved")
-        assert self._team.prior is not None
-        tensors = {f"belief/{name}": value for name, value in flat.items()}
-        tensors |= {"action": last.action, "prior": self._team.prior}
-        for stream, team in self.samples.times.items():
-            for robot, times in enumerate(team):
-                rows = np.array(self.samples.rows[stream][robot])
-                if times:
-                    tensors[f"time/{stream}/{robot}"] = torch.tensor(times)
-                    tensors[f"rows/{stream}/{robot}"] = torch.from_numpy(rows)
-        tensors = {name: value.contiguous().clone() for name, value in tensors.items()}
-        about = self._signature | {"start": str(self._start), "k": str(last.k)}
-        with staged_file(Path(path)) as file:
-            file.write_bytes(save(tensors, about))
+        state = {
+            "of": self._signature,
+            "start": self._start,
+            "k": last.k,
+            "belief": dict(flat.items()),
+            "action": last.action,
+            "prior": self._team.prior,
+            "samples": self.samples.state(),
+        }
+        state_file.save(Path(path), state)
 
     def load(self, path: str | Path) -> None:
-        """Go on from what ``save`` wrote.
+        """Go on from what ``save`` wrote, whole or, where anything is raised, not at all.
 
         Raises:
-            ValueError: the file is missing or damaged, or of another agent, team, step or sensors.
+            ValueError: the file is damaged, or of another agent, team, step or sensors.
+            OSError: it cannot be read.
         """
-        try:
-            with safe_open(path, "pt") as file:
-                about = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (OSError, SafetensorError) as error:
-            raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+        state = state_file.load(Path(path))
         for name, mine in self._signature.items():
-            if about.get(name) != mine:
-                raise ValueError(f"{path}: is of {name} {about.get(name)!r}, not {mine!r}")
-        try:
-            start, k = int(about["start"]), int(about["k"])
-            self._start, self._team.prior = start, tensors["prior"]
-            for name, times in tensors.items():
-                if name.startswith("time/"):
-                    _, stream, robot = name.split("/")
-                    rows = tensors[f"rows/{stream}/{robot}"].numpy()
-                    for stamp, row in zip(times.tolist(), rows, strict=True):
-                        self.samples.insert((stream, int(robot), stamp, row))
-                        self._newest = max(stamp, self._newest or stamp)
-            fresh = self.localizer.reset(self._team.observation(self._time(k), None))
-            flat = fresh.to_tensordict().flatten_keys("/")
-            for name, value in flat.items():
-                saved = tensors[f"belief/{name}"]
-                if saved.shape[:2] != value.shape[:2]:
-                    raise KeyError(name)
-                flat.set(name, saved)
-            belief = type(fresh).from_tensordict(flat.unflatten_keys("/"))
-            self._past = deque([_Past(k, belief, tensors["action"])], maxlen=self._past.maxlen)
-        except (KeyError, ValueError, IndexError) as error:
-            raise ValueError(f"{path}: holds no such belief: {error}") from None
+            if state.get("of", {}).get(name) != mine:
+                raise ValueError(f"{path}: {name} is not {mine!r}: it is of another localizer")
+        start, k, team = state["start"], state["k"], copy.deepcopy(self._team)
+        newest = team.samples.restore(state["samples"])
+        team.prior = state["prior"]
+        fresh = self.localizer.reset(team.observation(start + k * self._period, None))
+        flat = fresh.to_tensordict().flatten_keys("/")
+        if flat.keys() != state["belief"].keys():
+            raise ValueError(f"{path}: an older coloc's belief of {self.agent} has other parts")
+        flat.update(state["belief"])
+        belief = type(fresh).from_tensordict(flat.unflatten_keys("/"))
+        self._team, self.samples = team, team.samples
+        self._start, self._newest, self._redo = start, newest, None
+        self._past = deque([_Past(k, belief, state["action"])], maxlen=self._past.maxlen)
 
     @property
-    def _signature(self) -> dict[str, str]:
+    def _signature(self) -> dict[str, Any]:
         """What must be the same where a belief is loaded."""
-        streams = ",".join(self.samples.streams)
-        robots = ",".join(self.robots)
         return {
             "agent": self.agent,
-            "robots": robots,
-            "streams": streams,
-            "period": str(self._period),
+            "robots": list(self.robots),
+            "streams": list(self.samples.streams),
+            "period": self._period,
         }

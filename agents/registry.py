@@ -46,6 +46,7 @@ LOCALIZERS = Registry(
         "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
+        "stdcl_factors": "agents.stdcl.factors.localizer:LearnedFactors",
         "stgat": "agents.stdcl.stgat:StGat",
         "vmds": "agents.swarm.vmds:VelocityMds",
     },
@@ -71,12 +72,7 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
             texts[-1] += f":{piece}"
         else:
             texts.append(piece)
-    for text in texts:
-        key, value = options.parse(name, text, known)
-        if key in chosen:
-            raise ValueError(f"{name}: {key} is given twice")
-        chosen[key] = value
-    chosen = options.checked(name, chosen, known)
+    chosen = options.checked(name, options.parse_all(name, texts, known, chosen), known)
     believed: Believed = getattr(scenario, "believed", scenario)  # type: ignore[arg-type]
     _require_served(name, factory, believed)
     build = getattr(factory, "for_team", factory)

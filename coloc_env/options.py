@@ -199,6 +199,30 @@ def parse(owner: str, text: str, known: Mapping[str, Option]) -> tuple[str, Any]
     raise ValueError(_unfit(owner, known[key], value))
 
 
+def parse_all(
+    owner: str,
+    texts: Iterable[str],
+    known: Mapping[str, Option],
+    given: Mapping[str, Any] = types.MappingProxyType({}),
+) -> dict[str, Any]:
+    """Several ``key=value``, and what is ``given`` already. Raises ValueError, too, for an option
+    that is given twice."""
+    found = dict(given)
+    for text in texts:
+        key, value = parse(owner, text, known)
+        if key in found:
+            raise ValueError(f"{owner}: {key} is given twice")
+        found[key] = value
+    return found
+
+
+def typed(value: Any) -> str:
+    """A setting as it would be typed on a command line."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(typed, value))
+    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
+
+
 def require_known(what: str, wanted: Iterable[str] | None, known: Iterable[str]) -> None:
     """Raise ValueError for a wanted name that does not exist; None wants nothing in particular."""
     names = list(known)
@@ -242,7 +266,18 @@ def _known(owner: str, key: str, known: Mapping[str, Option]) -> None:
 
 
 def _unfit(owner: str, option: Option, value: Any) -> str:
-    return f"{owner}: {option.name}={value!r} is not allowed: {option.words} is needed"
+    words = option.words
+    if "number" in words and _beyond(value):
+        words += f", at most {_MOST:g},"
+    return f"{owner}: {option.name}={value!r} is not allowed: {words} is needed"
+
+
+def _beyond(value: Any) -> bool:
+    """Whether a value is a number, or the text of one, that is larger than any may be."""
+    try:
+        return abs(float(value)) > _MOST
+    except (TypeError, ValueError, OverflowError):
+        return isinstance(value, int)
 
 
 def _plain(value: Any) -> Any:

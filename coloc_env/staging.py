@@ -70,6 +70,17 @@ def staged_file(out: Path) -> Iterator[Path]:
         _sync(out.parent)
 
 
+class _Tried(Exception):
+    pass
+
+
+def require_writable(out: Path | None) -> None:
+    """Raise what ``staged_file`` would at once, before what the file is to hold is computed."""
+    if out is not None:
+        with suppress(_Tried), staged_file(out):
+            raise _Tried
+
+
 def recover(out: Path) -> None:
     """Complete a replacement in the folder ``out`` that was cut short by the end of its process."""
     out = _resolved(out)

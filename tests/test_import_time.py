@@ -55,14 +55,31 @@ def test_the_slow_are_not_loaded_before_they_are_used() -> None:
     assert "torch" not in loaded("import coloc_env, agents")
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "agents", "scenarios", "tasks"])
-def test_lists_need_no_torch(words: str) -> None:
-    code = (
+LISTS = ("--help", "--version", "agents", "scenarios", "tasks")
+
+
+def loaded_by(*lines: str) -> set[str]:
+    """What some lines of the command load, together."""
+    return loaded(
         "from typer.testing import CliRunner\n"
         "from training.cli.command import app\n"
-        f"result = CliRunner().invoke(app, {words.split()!r})\n"
-        "assert result.exit_code == 0, result.output\n"
+        f"for line in {lines!r}:\n"
+        "    result = CliRunner().invoke(app, line.split())\n"
+        "    assert result.exit_code == 0, result.output\n"
     )
-    assert "torch" not in loaded(code)
+
+
+def test_lists_need_no_torch() -> None:
+    assert "torch" not in loaded_by(*LISTS)
+
+
+def test_a_scenario_is_explained_without_what_only_agents_need() -> None:
+    """Its options stand beside what computes with them: torch itself cannot be avoided."""
+    assert not loaded_by("scenarios indoor-v0") & {"tensordict", "scipy", "matplotlib"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", LISTS)
+def test_lists_take_less_than_a_second(words: str) -> None:
     (took,) = seconds(("-m", "training.cli.command", words))
     assert took < 1.0, f"coloc {words}: {took:.2f} s"

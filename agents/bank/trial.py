@@ -12,20 +12,19 @@ from agents.localizer import Estimate
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 
-_BETTER = 2.0  # nats: evidence at which a restart takes the filter's place
 _OPEN = 1.0  # nats: evidence below which another restart may take the place of the one on trial
 
 
 class Trial(Bank):
     """A filter that is restarted only by what has predicted better than itself.
 
-    What it is restarted from becomes the candidate, with A = 0. At A > 2 this takes the filter's
+    What it is restarted from becomes the candidate, with A = 0. At A > −θ this takes the filter's
     place, and speaks; at A < θ the trial is over. Both branches have Huber's weights at most.
     """
 
     def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
         fallback, candidate, evidence, estimates = self.branches(belief, observation)
-        better, worse = evidence > _BETTER, evidence < self.options.restart
+        worse, better = evidence < self.options.restart, evidence > -self.options.restart
         fallback = copied(better, candidate, fallback)
         after = build(
             BankBelief,

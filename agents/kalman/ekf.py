@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.kalman.exchange import ExchangingEkf
-from agents.kalman.expanded import expanded_update
 from agents.kalman.filter import Beside, GaussianBelief, GaussianFilter
 from agents.kalman.fusion import Fusion
 from agents.kalman.intersection import Intersection
@@ -22,9 +21,9 @@ from agents.kalman.late import LateFusion
 from agents.kalman.pairwise import Pairwise
 from agents.localizer import Localizer
 from agents.models.biases import kept_share, reported
-from agents.models.measurements import make_measurements, received
+from agents.models.measurements import Neighbours, make_measurements, received
 from agents.models.ordered_update import by_kind, pick
-from agents.models.update import iterated_update
+from agents.models.update import Update, expanded_update, iterated_update
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.options import OpenShare, PositiveCount
@@ -47,8 +46,8 @@ class CooperativeEkf(GaussianFilter):
     covariance intersection, one neighbour after the other; ``pairwise``, UAVs that meet (at most
     ``partners`` a step) update jointly and keep what they then share; ``exchange``, all raw
     measurements reach everybody, who runs ``ekf_joint`` on them. ``second_order``, with
-    ``fusion=ci``: all neighbours at once, by their messages alone, and ranges expanded to the
-    second order, as ``ekf_joint`` has them, where priors are broad too.
+    ``fusion=ci``: the own measurements in one iteration, distances expanded to the second order, as
+    ``ekf_joint`` has them.
     """
 
     name = "ekf"
@@ -72,7 +71,7 @@ class CooperativeEkf(GaussianFilter):
         own, shared = by_kind(self.models)
         self.kinds = own, shared
         self.fusion: Fusion | None = None
-        if fusion == "ci" and shared and not second_order:
+        if fusion == "ci" and shared:
             self.fusion = Intersection(believed, self.process, pick(self.models, shared))
         elif fusion == "pairwise" and shared:
             models = pick(self.models, shared)
@@ -137,14 +136,16 @@ class CooperativeEkf(GaussianFilter):
         if self.fusion is not None:
             return self._fused(prior, beside, self.fusion)
         neighbours, seen = received(self.believed, prior.observation), prior.observation
-        if self.second_order:
-            found = expanded_update(prior, neighbours, self.screen)
-        else:
-            found = iterated_update(prior, neighbours, self.screen, self.iterations)
+        found = self._updated(prior, neighbours, self.screen)
         considered = self.biases.of_update(
             beside.considered, prior.covariance, found.covariance, found.blocks, found.trusts, seen
         )
         return found.state, found.covariance, found.memory, replace(beside, considered=considered)
+
+    def _updated(self, prior: Prediction, neighbours: Neighbours, screen: Screen) -> Update:
+        if self.second_order:
+            return expanded_update(prior, neighbours, screen)
+        return iterated_update(prior, neighbours, screen, self.iterations)
 
     def _fused(
         self, prior: Prediction, beside: Beside, fusion: Fusion
@@ -162,7 +163,7 @@ class CooperativeEkf(GaussianFilter):
         if own:
             models, fixed = pick(self.models, own), pick(trusts, own)
             screen = Fixed(self.process, models, fixed)
-            found = iterated_update(prior, neighbours, screen, self.iterations)
+            found = self._updated(prior, neighbours, screen)
             others = fusion.scaled(others, kept_share(p, found.covariance))
             considered = self.biases.of_update(
                 considered, p, found.covariance, found.blocks, fixed, seen, models

@@ -61,17 +61,18 @@ class Intersection(Fusion):
         heard = replace(heard, known=heard.known & sound)
         around = replace(heard, variance=torch.zeros_like(heard.variance))
         taken = []
-        for slot in range(self.believed.slots):
-            if not bool(heard.known[..., slot].any()):
-                continue
-            which = torch.full(x.shape[:2], slot, device=x.device)
+        world, uav = (torch.arange(size, device=x.device) for size in x.shape[:2])
+        first = heard.known.to(torch.int8).sort(dim=-1, descending=True, stable=True).indices
+        for turn in range(int(heard.known.sum(-1).max())):
+            which = first[..., turn]  # each UAV's next neighbour that is known, if there is one
+            one = theirs[world[:, None], uav, which]
             apart = p[..., None, :d, :d] + theirs
             blocks = [b.bent(apart, 1.0) for b in self.linearize(x, seen, around)]
             rows = rows_of(blocks, trusts, self.believed.slots, which)
-            omega = self._omega(p, theirs[..., slot, :, :], rows)
+            omega = self._omega(p, one, rows)
             wide = p / omega[..., None, None]
             share = (1 - omega).clamp_min(1e-9)[..., None, None]
-            noise = rows.partner @ theirs[..., slot, :, :] @ rows.partner.mT / share
+            noise = rows.partner @ one @ rows.partner.mT / share
             s = rows.own @ wide @ rows.own.mT + noise + torch.diag_embed(rows.variance)
             used = (omega < 1)[..., None, None]
             gain = torch.where(used, torch.linalg.solve(s, rows.own @ wide).mT, 0.0)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.models.measurements import Block, Measurement, Neighbours
+from agents.models.measurements.second_order import expanded
 from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.robust.screen import Prediction, Screen, Trust
 
@@ -97,3 +98,25 @@ def iterated_update(
         updated = torch.where(vague.unsqueeze(-1), found[1], updated)
     memory = screen.remember(prior, evidence, lambda: linearize(state, screen.models))
     return Update(state, updated, blocks, trusts, memory)
+
+
+def expanded_update(prior: Prediction, neighbours: Neighbours, screen: Screen) -> Update:
+    """One update of a prior by measurements of the UAV alone, distances expanded to the second
+    order: where the prior is broad, what lies across the line of sight counts as noise."""
+    process, d = screen.process, screen.process.dim
+    own = prior.covariance[..., None, :d, :d]
+
+    def linearize(at: Tensor) -> list[Block]:
+        seen = prior.observation
+        linear = [m.linearize(process, at, seen, neighbours) for m in screen.models]
+        return [
+            expanded(m, block, own, seen) for m, block in zip(screen.models, linear, strict=True)
+        ]
+
+    blocks = linearize(prior.state)
+    evidence = screen.judge(blocks, prior)
+    trusts = screen.weigh(blocks, evidence, True)
+    delta, covariance = posterior(prior.covariance, *information(blocks, trusts))
+    state = process.boxplus(prior.state, delta)
+    memory = screen.remember(prior, evidence, lambda: linearize(state))
+    return Update(state, covariance, blocks, trusts, memory)

@@ -168,8 +168,9 @@ def padded(
 def per_error(process: Process, std: dict[str, float]) -> list[float]:
     """A standard deviation for each component of the process's error."""
     d, turn = process.dim, process.attitude_error
+    size, drift = process.error_size - process.drift_size, [std["position"]] * process.drift_size
     if turn is None:
-        return ([std["position"]] * d + [std["velocity"]] * d)[: process.error_size]
+        return ([std["position"]] * d + [std["velocity"]] * d)[:size] + drift
     linear = [std["position"]] * d + [std["velocity"]] * (turn.start - d)
     biases = [std["accel"]] * 3 + [std["gyro"]] * 3
-    return (linear + [std["attitude"]] * (turn.stop - turn.start) + biases)[: process.error_size]
+    return (linear + [std["attitude"]] * (turn.stop - turn.start) + biases)[:size] + drift

@@ -30,6 +30,7 @@ _CLIP = 5.0  # standard deviations
 _SOFT = 2.0
 _TUKEY = 4.685
 _LINK_TIME = 8.0  # steps over which a link's residual is averaged
+_SECOND = 1.0  # s: relative speeds count as what they add up to in a step of training
 _TIMES = (10.0, 40.0)  # steps over which innovations are averaged
 
 
@@ -46,7 +47,8 @@ class RunningMeans(TensorClass):
 @dataclass(frozen=True)
 class GraphInputs:
     """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, scalars of each ``link`` and
-    which links exist (``mask``), which nodes are ``free``; of displacements through ranges: the
+    which links exist (``mask``), how fast their ends move ``apart`` (‖Δv_ij‖, m/s; 0 without a
+    link), which nodes are ``free``; of displacements through ranges: the
     ``position`` (m, centred) and ``length`` (m) of links, their ``weight`` W_ij (1/m²), and
     ``gain`` H_i⁻¹ (m²), H_i = Σ_j W_ij u uᵀ + λ I with the prior's ``precision`` λ (1/m²); and the
     ``max_offset`` δ_max of corrections (m)."""
@@ -55,6 +57,7 @@ class GraphInputs:
     vectors: Float64[Tensor, "B N d C"]
     link: Float64[Tensor, "B N N L"]
     mask: Bool[Tensor, "B N N"]
+    apart: Float64[Tensor, "B N N"]
     free: Bool[Tensor, "B N"]
     position: Float64[Tensor, "B N d"]
     length: Float64[Tensor, "B N N"]
@@ -123,8 +126,8 @@ def graph_inputs(
     vectors = torch.cat((steps, innovation.unsqueeze(-1), means.innovations), -1)
     vectors = torch.where(inputs.fixed[..., None, None], 0.0, vectors)
     confidence = (weight * std**2).clamp_max(1.0)
-    relative_speed = lengths(inputs.state[..., d : 2 * d]) * mask
-    each = (error, lasting, confidence, torch.log1p(relative_speed / std))
+    apart = lengths(inputs.state[..., d : 2 * d]) * mask
+    each = (error, lasting, confidence, torch.log1p(apart * _SECOND / std))
     scalars = _scalars(inputs, solution, std, means, h, root, each)
     error, lasting, confidence, speed = each
     link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(means.seen) / 3, confidence,
@@ -134,6 +137,7 @@ def graph_inputs(
         vectors=vectors,
         link=torch.stack(link, -1),
         mask=mask,
+        apart=apart,
         free=~inputs.fixed,
         position=y,
         length=length,

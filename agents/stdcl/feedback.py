@@ -12,22 +12,23 @@ from agents.swarm.belief import Solution, StepInput
 from agents.swarm.links import lengths
 
 FeedbackKind = Literal["none", "paper", "links", "positions", "learned"]
-_MAX_RATE = math.log(1.1)  # of a confidence in a step, as a logarithm: the paper's 10 %
+_MOST = 0.1  # of a confidence in a step: the paper's 10 %
+_MAX_RATE = math.log(1 + _MOST)  # the same as a logarithm
 _C_MIN = 0.1  # smallest confidence of a link
-_KAPPA = 0.05  # κ of equation 36
+KAPPA = 0.02  # κ of equation 36: up to 5 σ a link loses less than 10 %
 
 
 class Feedback:
-    """No feedback: the optimizer goes on from its own positions, with its own weights."""
+    """No feedback: the optimizer goes on from its own positions, with its own weights.
+
+    ``kappa``: κ of equation 36, which only ``paper`` has.
+    """
 
     positions = False  # the next step starts from the corrected positions
     links = False  # the links' confidence c_ij weights the next step's ranges
 
-    def target(
-        self, inputs: StepInput, corrected: Solution, correction: Correction, std: float
-    ) -> Float64[Tensor, "B N N"]:
-        """The confidence that links should have after a step."""
-        return correction.confidence.double()
+    def __init__(self, kappa: float = KAPPA) -> None:
+        self.kappa = kappa
 
     def confidence(
         self,
@@ -37,14 +38,8 @@ class Feedback:
         correction: Correction,
         std: float,
     ) -> Float64[Tensor, "B N N"]:
-        """The links' confidence after a step: nearer to the target by at most 10 %, at least
-        ``_C_MIN``; without a range, as before."""
-        if not self.links:
-            return before
-        target = self.target(inputs, corrected, correction, std)
-        change = (target.clamp_min(_C_MIN) / before).log()
-        after = before * torch.exp(_MAX_RATE * torch.tanh(change / _MAX_RATE))
-        return torch.where(inputs.links.mask, after, before)
+        """The links' confidence after a step; without a range, as before."""
+        return before
 
 
 class PositionFeedback(Feedback):
@@ -58,22 +53,46 @@ class LinkFeedback(Feedback):
 
     links = True
 
+    def confidence(
+        self,
+        before: Float64[Tensor, "B N N"],
+        inputs: StepInput,
+        corrected: Solution,
+        correction: Correction,
+        std: float,
+    ) -> Float64[Tensor, "B N N"]:
+        """Nearer to the network's by at most 10 %, at least ``_C_MIN``."""
+        change = (correction.confidence.double().clamp_min(_C_MIN) / before).log()
+        after = before * torch.exp(_MAX_RATE * torch.tanh(change / _MAX_RATE))
+        return torch.where(inputs.links.mask, after, before)
 
-class LearnedFeedback(Feedback):
+
+class LearnedFeedback(LinkFeedback):
     """Both positions and links."""
 
     positions = True
+
+
+class PaperFeedback(Feedback):
+    """Equation 36: c_ij ← c_ij exp(−κ |d̃_ij − ‖p̂_i − p̂_j‖|/σ), at most 10 % less in a step and
+    at least ``_C_MIN``.
+
+    It accumulates: a confidence never rises again, as the paper has nothing that would raise it.
+    """
+
     links = True
 
-
-class PaperFeedback(LinkFeedback):
-    """Links by equation 36: c_ij → exp(−κ |d̃_ij − ‖p̂_i − p̂_j‖|/σ)."""
-
-    def target(
-        self, inputs: StepInput, corrected: Solution, correction: Correction, std: float
+    def confidence(
+        self,
+        before: Float64[Tensor, "B N N"],
+        inputs: StepInput,
+        corrected: Solution,
+        correction: Correction,
+        std: float,
     ) -> Float64[Tensor, "B N N"]:
         residual = inputs.links.distance - lengths(corrected.position)
-        return torch.exp(-_KAPPA * (residual.abs() / std))
+        factor = torch.exp(-self.kappa * residual.abs() / std).clamp_min(1 - _MOST)
+        return torch.where(inputs.links.mask, (before * factor).clamp_min(_C_MIN), before)
 
 
 FEEDBACKS: dict[FeedbackKind, type[Feedback]] = {

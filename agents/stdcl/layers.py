@@ -5,7 +5,7 @@ and mixed by the same linear map on every axis, so that layers are equivariant t
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -13,8 +13,8 @@ from agents.layers import Linear, sigmoid
 from agents.stdcl.features import LINKS, GraphInputs
 from agents.swarm.links import along_links
 
-MAX_SPEED = 2.0  # in units of the mean relative speed of a UAV's links
-MIN_CONFIDENCE = 0.1
+FAST = 1.5  # times the mean relative speed of a UAV's links: from here on a link may be cut
+DOUBTED = 0.5  # confidence up to which it is: what equation 17 leaves a link flagged as NLOS
 _SLOPE = 0.2  # of the leaky rectifier
 _CONFIDENCE, _SPEED = LINKS.index("confidence"), LINKS.index("relative_speed")
 
@@ -44,15 +44,17 @@ class TopologicalAttention(nn.Module):
     Equation 29: h_i' = z ⊙ h_i + (1 − z) ⊙ Σ_j α_ij W h_j, z = σ(W_z [h_i ‖ Σ_j α_ij W h_j] + b);
     the sum goes through a swish where it is added.
 
-    Links with a large relative speed ‖Δv_ij‖ and a low confidence c_ij are cut. Vectors of
-    neighbours are averaged by α, and pushed through ranges, H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j.
-    ``kinematic=False``: without ‖Δv‖, c and the cut, plain graph attention (Veličković et al.,
-    ICLR 2018).
+    Links that are ``FAST`` (‖Δv_ij‖) and ``DOUBTED`` (c_ij) are cut; the paper's thresholds are
+    lost with its equation. Vectors of neighbours are averaged by α, and pushed through ranges,
+    H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j. ``cut=False``: no link is cut. ``kinematic=False``: without ‖Δv‖
+    and c as well, plain graph attention (Veličković et al., ICLR 2018).
     """
 
-    def __init__(self, width: int, channels: int, pushed: int, kinematic: bool = True) -> None:
+    def __init__(
+        self, width: int, channels: int, pushed: int, kinematic: bool = True, cut: bool = True
+    ) -> None:
         super().__init__()
-        self.kinematic = kinematic
+        self.kinematic, self.cut = kinematic, kinematic and cut
         self.map = Linear(width, width)  # W
         self.ends = Linear(width, 2)  # a, of h_i and of h_j
         self.relative = nn.Parameter(torch.tensor((-0.5, 1.0)))  # a, of ‖Δv‖ and of c
@@ -82,10 +84,19 @@ class TopologicalAttention(nn.Module):
         if self.kinematic:
             speed, confidence = graph.link[..., _SPEED], graph.link[..., _CONFIDENCE]
             logit = logit + self.relative[0] * speed + self.relative[1] * confidence
-            mean = speed.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True).clamp_min(1)
-            mask = mask & ~((speed > MAX_SPEED * mean) & (confidence < MIN_CONFIDENCE))
+        if self.cut:
+            mask = mask & ~cut_links(graph)
         logit = functional.leaky_relu(logit, _SLOPE).masked_fill(~mask, -1e9)
         return torch.softmax(logit, -1) * mask
+
+
+def cut_links(graph: GraphInputs) -> Bool[Tensor, "B N N"]:
+    """Links that the attention of UAV i cuts: ‖Δv_ij‖ above ``FAST`` times the mean over its links,
+    and c_ij at most ``DOUBTED``."""
+    apart, count = graph.apart, graph.mask.sum(-1, keepdim=True).clamp_min(1)
+    mean = apart.sum(-1, keepdim=True) / count
+    doubted = graph.link[..., _CONFIDENCE] <= DOUBTED
+    return graph.mask & (apart > FAST * mean) & doubted
 
 
 def pushed_by_ranges(graph: GraphInputs, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B N d C"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from agents.localizer import Estimate, Localizer
 from agents.models.process import drives
 from agents.stdcl.features import GraphInputs, RunningMeans, graph_inputs, initial_means
-from agents.stdcl.feedback import FEEDBACKS, FeedbackKind
+from agents.stdcl.feedback import FEEDBACKS, KAPPA, FeedbackKind
 from agents.stdcl.network import ConvolutionState, Correction, StGnn
 from agents.swarm import joint
 from agents.swarm.anchored import is_plain
@@ -41,7 +41,8 @@ class NetworkLoop(Localizer[LoopBelief]):
 
     ``feedback``: ``positions``, the next step starts from the corrected positions and their
     variance; ``links``, the network's confidence weights each link; ``learned``, both; ``paper``,
-    links are weighted by equation 36; ``none``. A confidence changes by 10 % a step at most.
+    links are weighted by equation 36 with the gain ``kappa``; ``none``. A confidence changes by
+    10 % a step at most.
 
     Where gradients are required, feedback is differentiated through the next solution in first
     order, neighbours held: ∂y/∂m = λ H⁻¹, ∂y/∂c_ij = H⁻¹ W_ij (d̃_ij − ‖y_i − y_j‖) u_ij / c_ij.
@@ -50,13 +51,15 @@ class NetworkLoop(Localizer[LoopBelief]):
     centralized = True
     serves = (Ranging, PositionFix)
 
-    def __init__(self, base: SwarmFilter, network: StGnn, feedback: FeedbackKind) -> None:
+    def __init__(
+        self, base: SwarmFilter, network: StGnn, feedback: FeedbackKind, kappa: float = KAPPA
+    ) -> None:
         super().__init__(base.believed)
         if not is_plain(base.believed):
             raise ValueError(
                 "a team is needed whose motion an INS drives, with ranges between centres"
             )
-        self.base, self.feedback = base, FEEDBACKS[feedback]()
+        self.base, self.feedback = base, FEEDBACKS[feedback](kappa)
         self.rate = min(1.0, base.believed.arena.dt / _TRAINING_DT)
         self.network = network.double().requires_grad_(False)
 
@@ -164,8 +167,9 @@ def _corrected(
     position = solution.position + correction.offset.double()
     variance = solution.variance * correction.variance_factor.double() ** rate
     variance = torch.where(free, torch.minimum(variance, inputs.variance), solution.variance)
-    return Solution(
-        torch.where(free.unsqueeze(-1), position, solution.position),
-        variance,
-        None if solution.joint is None else joint.rescale(solution.joint, variance),
+    return replace(
+        solution,
+        position=torch.where(free.unsqueeze(-1), position, solution.position),
+        variance=variance,
+        joint=None if solution.joint is None else joint.rescale(solution.joint, variance),
     )

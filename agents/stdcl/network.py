@@ -12,7 +12,6 @@ from agents.stdcl.features import LINKS, SCALARS, VECTORS, GraphInputs
 from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, push, swish
 from agents.weights import Learned
 
-DILATIONS = (1, 2, 4)
 _PUSHED = 4  # vector channels of neighbours' displacements through ranges
 _EDGE = 8  # hidden units of the links' confidence
 _TINY = 1e-9  # m
@@ -41,7 +40,9 @@ class StGnn(Learned):
     """Equations 27 to 35, with vectors in metres beside the paper's scalars.
 
     ``width`` d = 64; ``kernel`` K = 3 (the paper has 3 in one place and a field of K = 2 in
-    another); ``kinematic=False``: plain graph attention; ``temporal=False``: no convolutions.
+    another); ``levels`` L: convolutions with the dilations 1, 2, 4, … 2^(L−1) (0: none);
+    ``kinematic=False``: plain graph attention; ``cut=False``: the attention cuts no links, as in
+    networks that were trained before it did.
     """
 
     kind = "stgnn"
@@ -53,7 +54,8 @@ class StGnn(Learned):
         kernel: int = 3,
         hops: int = 2,
         kinematic: bool = True,
-        temporal: bool = True,
+        cut: bool = True,
+        levels: int = 3,
     ) -> None:
         super().__init__()
         self.architecture = {
@@ -61,17 +63,17 @@ class StGnn(Learned):
             "kernel": kernel,
             "hops": hops,
             "kinematic": kinematic,
-            "temporal": temporal,
+            "cut": cut,
+            "levels": levels,
         }
         channels = len(VECTORS)
         self.width, self.channels = width, channels
         self.encode = nn.ModuleList((Linear(len(SCALARS), width), Linear(width, width)))
         self.hops = nn.ModuleList(
-            TopologicalAttention(width, channels, _PUSHED, kinematic) for _ in range(hops)
+            TopologicalAttention(width, channels, _PUSHED, kinematic, cut) for _ in range(hops)
         )
         self.times = nn.ModuleList(
-            DilatedConvolution(width, channels, kernel, dilation)
-            for dilation in (DILATIONS if temporal else ())
+            DilatedConvolution(width, channels, kernel, 2**level) for level in range(levels)
         )
         self.scale = Linear(width, 1)  # logits of equation 32
         self.out = Linear(width, channels)

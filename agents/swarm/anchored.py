@@ -1,8 +1,8 @@
 """Swarm filters for teams with anchors, lever arms, heights, or a full motion model.
 
 A swarm filter estimates positions from an INS's velocities and links between centres. All else is
-added around it: the full motion model, heights and slow flight, lever arms, and anchors, which
-become members of the team with position fixes.
+added around it: the full motion model, heights, slow flight, optical flow and time differences,
+lever arms, and anchors, which become members of the team with position fixes.
 """
 
 from collections.abc import Callable
@@ -27,11 +27,20 @@ from agents.swarm.considered import Moments, after_step
 from agents.swarm.filter import SwarmFilter
 from agents.swarm.links import Links
 from agents.swarm.marginals import block_diagonal, range_update, with_marginals
-from agents.swarm.navigation import NavigationFilter
+from agents.swarm.navigation import NavigationFilter, all_have_fixes
 from agents.tensorclasses import build
 from coloc_env.observation import Observation, prior_width
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Ins,
+    OpticalFlow,
+    PositionFix,
+    Ranging,
+    SlowFlight,
+    Tdoa,
+)
 from coloc_env.sensors.base import usable
 
 _M = TypeVar("_M", bound=SwarmFilter)
@@ -73,11 +82,12 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         self.process = make_process(believed)
         self.navigation = NavigationFilter(believed, self.process)
         self.centres = Centres(believed, ranging)
-        self.fixed = believed.sensor(PositionFix)
+        self.fixed = None if all_have_fixes(believed) else believed.sensor(PositionFix)
         fixes = self.fixed or PositionFix(_SURVEYED)
         swarm = method(self._team(ranging, fixes))
         assert isinstance(swarm, SwarmFilter)
-        self.swarm, self.variance = swarm, fixes.std**2
+        self.swarm = swarm
+        self.variance = max(fixes.axis_std(self.process.dim)) ** 2
         if self.swarm.window:
             raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
@@ -255,7 +265,8 @@ def is_plain(believed: Believed) -> bool:
     positions."""
     ranging = believed.sensor(Ranging)
     lever_arms = ranging is not None and ranging.tags
-    others = any(believed.sensor(kind) for kind in (AnchorRanging, Height, SlowFlight))
+    kinds = (AnchorRanging, Height, OpticalFlow, SlowFlight, Tdoa)
+    others = any(believed.sensor(kind) for kind in kinds) or all_have_fixes(believed)
     process = make_process(believed)
     return not (lever_arms or others or process.error_size > process.dim)
 

@@ -11,6 +11,7 @@ from agents.swarm import delays, joint
 from agents.swarm.calibration import ErrorModel
 from agents.swarm.delays import Delays
 from agents.swarm.ins_bias import InsBias
+from agents.swarm.joint_bias import JointBias
 from agents.swarm.links import Links, lengths
 from agents.swarm.window import RangeWindow
 
@@ -22,9 +23,10 @@ class SwarmBelief(TensorClass):
 
     ``state``: position as last estimated and the rest of the state by dead reckoning;
     ``variance`` of the position (m² per axis); ``joint``: the UAV's rows of the team's joint
-    covariance (m², see ``agents.swarm.joint``; of width 0 where it is not kept); ``ins_bias``;
-    ``step``: steps taken; ``error_sums`` and ``transitions``: sufficient statistics of the range
-    errors and of how links change between line of sight and NLOS, the same for all UAVs;
+    covariance (m², see ``agents.swarm.joint``; of width 0 where it is not kept); ``ins_bias``, and
+    ``joint_bias``: its covariances with all else (of width 0: not kept); ``step``: steps taken;
+    ``error_sums`` and ``transitions``: sufficient statistics of the range errors and of how links
+    change between line of sight and NLOS, the same for all UAVs;
     ``link_memory``: what the confidence remembers of each link (of width 0: nothing);
     ``localizable``: connected to at least d + 1 anchors; ``window`` of past steps (of length 0:
     none); ``delays`` of antennas and clocks; ``considered``: what sensors' biases have made of the
@@ -35,6 +37,7 @@ class SwarmBelief(TensorClass):
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"]
     ins_bias: InsBias
+    joint_bias: JointBias
     step: Int64[Tensor, "B N"]
     error_sums: Float64[Tensor, "B N 2 3"]
     transitions: Float64[Tensor, "B N 2 2"]
@@ -54,7 +57,8 @@ class StepInput:
     added to it; ``fixed``: who has a position fix; ``links``: ranges d̃_ij, without the delays that
     are known; ``error_model`` of ranges; ``predicted_variance``: P before fixes (m²); ``joint``:
     joint covariance of the priors (m²; of width 0 where it is not kept); ``pair_variance`` of the
-    vectors between UAVs (m² per axis); ``ins_bias`` (None: not estimated); ``transitions`` of links
+    vectors between UAVs (m² per axis); ``ins_bias`` (None: not estimated) and ``joint_bias`` (None:
+    not kept); ``transitions`` of links
     between line of sight and NLOS; ``delays``; ``outlier_probability`` of each link beforehand
     (None: the share of all); ``packet_loss``: share of steps without a range, ρ_ij of equation 17
     (None: not used); ``confidence``: factor c_ij on each link's weight from outside (None: 1; above
@@ -75,6 +79,7 @@ class StepInput:
     ins_bias: InsBias | None
     transitions: Float64[Tensor, "B 2 2"]
     delays: Delays
+    joint_bias: JointBias | None = None
     outlier_probability: Float64[Tensor, "B N N"] | None = None
     packet_loss: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
@@ -84,13 +89,17 @@ class StepInput:
 @dataclass(frozen=True)
 class Solution:
     """Positions (m), their ``variance`` (m² per axis), the ``joint`` covariance (None: not kept),
-    the ``window`` with this step in it and the ``delays`` (None: as before)."""
+    the ``window`` with this step in it and the ``delays`` (None: as before), the INS's biases with
+    their covariances (``joint_bias``; None: they follow from the variance), and each link's
+    posterior probability of NLOS (``outlier``; None: it follows from the residual)."""
 
     position: Float64[Tensor, "B N d"]
     variance: Float64[Tensor, "B N"]
     joint: Float64[Tensor, "B N e K"] | None = None
     window: RangeWindow | None = None
     delays: Delays | None = None
+    joint_bias: tuple[InsBias, JointBias] | None = None
+    outlier: Float64[Tensor, "B N N"] | None = None
 
     def residual(self, inputs: StepInput) -> Float64[Tensor, "B N N"]:
         """d̃_ij − ‖p_i − p_j‖ (m), less this step's correction of the delays."""

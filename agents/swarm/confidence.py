@@ -172,6 +172,8 @@ class EmConfidence(Confidence):
         """Each link's posterior probability of NLOS; the predicted one without a range."""
         prior = inputs.outlier_probability
         assert prior is not None
+        if solution.outlier is not None:
+            return torch.where(inputs.links.mask, solution.outlier, prior)
         posterior = calibration.outlier_posterior(
             inputs.error_model,
             solution.residual(inputs).flatten(1),

@@ -54,8 +54,7 @@ def predict(
     fixed UAVs). s, a sine of unknown phase, is modelled as a Gauss–Markov process whose time
     constant is a radian of the sine."""
     n, variance = factor.shape[1], _variance(clock, factor)
-    phi = torch.ones_like(dt).unsqueeze(-1).repeat(1, 1, 2)
-    phi[..., 1] = torch.exp(-dt * (2 * math.pi / clock.period))
+    phi = remaining(dt, clock)
     every = phi.flatten(1)
     common = phi.unsqueeze(-1) * every[:, None, None] * delays.common
     common.flatten(1, 2).diagonal(dim1=-2, dim2=-1).add_(variance.repeat(n) * (1 - every.square()))
@@ -63,6 +62,11 @@ def predict(
     return delays.replace(
         delay=phi * delays.delay, cross=factor * every[:, None, None] * delays.cross, common=common
     )
+
+
+def remaining(dt: Float64[Tensor, "B N"], clock: Clock) -> Float64[Tensor, "B N 2"]:
+    """What is left of a and s after ``dt`` s, as factors."""
+    return torch.stack((torch.ones_like(dt), torch.exp(-dt * (2 * math.pi / clock.period))), -1)
 
 
 def incidence(like: Float64[Tensor, "B N *s"]) -> Float64[Tensor, "2 N N"]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.kalman.filter import elapsed
-from agents.swarm import joint
+from agents.swarm import adaptive, joint
 from agents.swarm import window as windows
 from agents.swarm.anchored import supports_anchors
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
@@ -45,6 +45,10 @@ class DynamicMds(SwarmFilter):
     the ``decay`` in 1/s; the prior is then that of the oldest of them. The paper's T is
     min(T_max, ⌈√(2R/a_max)/Δt⌉), R the radius of communication. Displacements are taken for exact,
     ``decay`` stands for their errors.
+
+    ``adaptive=true``: as printed, λ follows the error that dead reckoning accumulates and λ_s the
+    average degree (``agents.swarm.adaptive``): a prior whose weight is the links' own, not that of
+    its covariance, which the estimate's covariance then inherits.
     """
 
     name = "dwmds_st"
@@ -59,13 +63,14 @@ class DynamicMds(SwarmFilter):
         v_max: PositiveSpeed | None = None,
         window: Count = 0,
         decay: Annotated[float, Quantity("1/s", 0.0)] = 0.05,
+        adaptive: bool = False,
         iterations: PositiveCount = 5,
         first: PositiveCount = 60,
     ) -> None:
         super().__init__(believed, confidence, bias)
         require_iterations(iterations, first)
         self.prior, self.iterations, self.first, self.v_max = prior, iterations, first, v_max
-        self.window, self.decay = window, decay
+        self.window, self.decay, self.adaptive = window, decay, adaptive
         self.recursive = prior
 
     def initial_joint(self, variance: Float64[Tensor, "B N"]) -> Float64[Tensor, "B N e K"]:
@@ -77,9 +82,9 @@ class DynamicMds(SwarmFilter):
         free = joint.free_indices(inputs.fixed)
         fixed, window = inputs.fixed.unsqueeze(-1), inputs.window
         prior, covariance = inputs.prior, inputs.joint
-        if window is not None:
+        if window is not None and not self.adaptive:
             prior, covariance = windows.oldest_prior(window)
-        precision = self._precision(covariance, inputs.fixed, free)  # Λ
+        precision = self._precision(covariance, inputs, free)  # Λ
         majorant, information = precision, precision  # of all terms but the step's own links
         if window is not None:
             past = window.information.sum(2) / self.process.dim
@@ -118,16 +123,29 @@ class DynamicMds(SwarmFilter):
             )
         return Solution(y, joint.marginal_variances(posterior), posterior, window)
 
+    def decay_rate(
+        self,
+        noise: Float64[Tensor, "B N"],
+        fixed: Bool[Tensor, "B N"],
+        dt: Float64[Tensor, "B N"],
+    ) -> float | Float64[Tensor, "B 1"]:
+        return adaptive.decay(noise, ~fixed, self.std, dt) if self.adaptive else self.decay
+
     def _precision(
         self,
         covariance: Float64[Tensor, "B N e K"],
-        fixed: Bool[Tensor, "B N"],
+        inputs: StepInput,
         free: Int64[Tensor, "M"],
     ) -> Float64[Tensor, "B L L"]:
-        """The precision Λ = P⁻¹ of the prior (1/m²), at free UAVs."""
-        if self.prior:
-            return joint.precision(joint.submatrix(covariance, free), fixed[:, free])
-        return torch.diag_embed(_NO_PRIOR * (~fixed[:, free]).double())
+        """The precision Λ of the prior (1/m²), at free UAVs: P⁻¹, or λ_s/(σ Δt)² I."""
+        fixed = inputs.fixed[:, free]
+        if self.prior and not self.adaptive:
+            return joint.precision(joint.submatrix(covariance, free), fixed)
+        each = (~fixed).double()
+        if not self.prior:
+            return torch.diag_embed(_NO_PRIOR * each)
+        strength = adaptive.smoothing(inputs.links.mask, self.std).clamp_min(_NO_PRIOR)
+        return torch.diag_embed(strength.unsqueeze(-1) * each)
 
     def _posterior(
         self,

@@ -11,18 +11,26 @@ from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import UavRanges
 from agents.models.process import make_process
-from agents.swarm import calibration, delays, ins_bias, joint, persistence, window
+from agents.swarm import calibration, delays, ins_bias, joint, joint_bias, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
 from agents.swarm.considered import Moments, after_step
-from agents.swarm.delays import Delays
+from agents.swarm.dead_reckoning import DeadReckoning, Predicted
 from agents.swarm.links import Links, connected, lengths, links_of
 from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
-from coloc_env.sensors import AnchorRanging, Height, Ins, PositionFix, Ranging, SlowFlight
-from coloc_env.sensors.base import usable
+from coloc_env.sensors import (
+    AnchorRanging,
+    Height,
+    Ins,
+    OpticalFlow,
+    PositionFix,
+    Ranging,
+    SlowFlight,
+    Tdoa,
+)
 
 _MIN_VARIANCE = 1e-6  # m² per axis: of a prior that is believed to be exact
 
@@ -35,11 +43,12 @@ class SwarmFilter(Localizer[SwarmBelief]):
     """
 
     centralized = True
-    # Teams with anchors, heights or slow flight are served through ``agents.swarm.anchored``.
-    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight)
+    # Teams with more than ranges between UAVs are served through ``agents.swarm.anchored``.
+    serves = (Ranging, AnchorRanging, PositionFix, Height, SlowFlight, OpticalFlow, Tdoa)
     window = 0  # past steps in the stress
     decay = 0.0  # λ of w(τ) = exp(−λ (t − τ)), 1/s
     recursive = True  # the solution has dead reckoning as its prior
+    jointly_biased = False  # the covariance of all biases is kept
     dense = True  # many links to each UAV: enough to calibrate all, and to over-relax
 
     def __init__(
@@ -63,6 +72,9 @@ class SwarmFilter(Localizer[SwarmBelief]):
         clock = sensor.clock
         off = clock is not None and clock.offset + clock.skew > 0
         self.clock = clock if delays and off else None
+        self.dead_reckoning = DeadReckoning(
+            self.process, self.ins, self.clock, believed.sensor(PositionFix)
+        )
 
     @abstractmethod
     def solve(self, belief: SwarmBelief, inputs: StepInput) -> Solution:
@@ -80,18 +92,20 @@ class SwarmFilter(Localizer[SwarmBelief]):
         variance = variance.clamp_min(_MIN_VARIANCE)
         model = calibration.prior_model(len(state), self.std, state.device)
         covariance = self.initial_joint(variance)
+        offsets = delays.initial(position, self.clock)
         return SwarmBelief(
             state=state,
             variance=variance,
             joint=covariance,
             ins_bias=ins_bias.initial(position, self.ins),
+            joint_bias=joint_bias.initial(position, offsets, self.ins, self.jointly_biased),
             step=torch.zeros(shape, dtype=torch.int64, device=state.device),
             error_sums=_per_uav(model.sums, shape),
             transitions=_per_uav(persistence.prior_counts(model.share[:, 1]), shape),
             link_memory=self.confidence.initial_memory(model, shape),
             localizable=torch.zeros(shape, dtype=torch.bool, device=state.device),
             window=window.empty(position, covariance, self.window),
-            delays=delays.initial(position, self.clock),
+            delays=offsets,
             considered=self.biases.initial(observation, self._marginals(variance)),
             batch_size=shape,
         )
@@ -130,53 +144,39 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def predict(self, belief: SwarmBelief, observation: Observation) -> StepInput:
         """Dead reckoning to the observation's step, and the step's fixes and links."""
-        d, dt = self.process.dim, elapsed(self.process, belief.step).double()
-        u = self.process.inputs(observation)
-        if self.ins is None:
-            bias, factor = None, torch.ones_like(dt)
-            _, q = self.process.linearize(belief.state, u, dt)
-            noise = q[..., :d, :d].diagonal(dim1=-2, dim2=-1).mean(-1)
-        else:
-            bias = ins_bias.decay(belief.ins_bias, dt, self.ins)
-            u = u - bias.bias
-            bias, factor, noise = ins_bias.predict(bias, belief.variance, dt, self.ins)
-        state = self.process.propagate(belief.state, u, dt)
-        fixed, prior, fix_variance = self._fixes(observation, state[..., :d])
-        predicted = factor.square() * belief.variance + noise  # P ← f² P + q²
-        variance = torch.where(fixed, fix_variance, predicted)
-        if belief.joint.shape[-1]:
-            covariance = joint.predict(belief.joint, factor, noise, fixed, fix_variance)
-            pair_variance = joint.pair_variance(covariance)
-        else:
-            covariance = belief.joint
-            pair_variance = variance.unsqueeze(-1) + variance.unsqueeze(-2)
-        links, delay = self._links(observation, belief.delays, factor, fixed, dt)
+        at = self.dead_reckoning.predict(belief, observation)
+        links, pair_variance = links_of(observation), self._pair_variance(at)
         if self.clock is not None:
-            pair_variance = pair_variance + delays.offset_variance(delay)
+            distance = links.distance - delays.offsets(at.delays.delay)
+            links = Links(torch.where(links.mask, distance, 0.0), links.mask)
+            pair_variance = pair_variance + delays.offset_variance(at.delays)
         sums = belief.error_sums[:, 0]
         inputs = StepInput(
-            state=state,
-            prior=prior,
-            variance=variance,
-            process_noise=noise,
-            fixed=fixed,
+            state=at.state,
+            prior=at.prior,
+            variance=at.variance,
+            process_noise=at.process_noise,
+            fixed=at.fixed,
             links=links,
             error_model=calibration.ErrorModel(sums=sums, batch_size=sums.shape[:1]),
-            predicted_variance=predicted,
-            joint=covariance,
+            predicted_variance=at.predicted_variance,
+            joint=at.joint,
             pair_variance=pair_variance,
-            ins_bias=bias,
+            ins_bias=at.ins_bias,
+            joint_bias=at.joint_bias,
             transitions=belief.transitions[:, 0],
-            delays=delay,
-            window=self._window(belief, prior, factor, noise, fixed, fix_variance, dt),
+            delays=at.delays,
+            window=self._window(belief, at),
         )
         return self.confidence.calibrate(inputs, belief.link_memory, self.dense)
 
     def update(self, belief: SwarmBelief, inputs: StepInput, solution: Solution) -> SwarmBelief:
         """The belief after a step with this solution."""
         d, shape = self.process.dim, inputs.fixed.shape
-        bias = belief.ins_bias
-        if inputs.ins_bias is not None:
+        bias, known = belief.ins_bias, belief.joint_bias
+        if solution.joint_bias is not None:
+            bias, known = solution.joint_bias
+        elif inputs.ins_bias is not None:
             innovation = solution.position - inputs.state[..., :d]
             bias = ins_bias.update(
                 inputs.ins_bias, innovation, inputs.predicted_variance, solution.variance
@@ -188,6 +188,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
             variance=solution.variance,
             joint=inputs.joint if solution.joint is None else solution.joint,
             ins_bias=bias,
+            joint_bias=known,
             step=belief.step + 1,
             error_sums=_per_uav(inputs.error_model.sums, shape),
             transitions=_per_uav(inputs.transitions, shape),
@@ -242,54 +243,31 @@ class SwarmFilter(Localizer[SwarmBelief]):
         weight, shift = self.confidence.weights(residual, inputs)
         return (weight if inputs.confidence is None else inputs.confidence * weight), shift
 
-    def _fixes(
-        self, observation: Observation, position: Float64[Tensor, "B N d"]
-    ) -> tuple[Bool[Tensor, "B N"], Float64[Tensor, "B N d"], float]:
-        """Who has a position fix, the predicted positions with the fixes in their place (m), and
-        the variance of fixes (m²)."""
-        sensor = self.believed.sensor(PositionFix)
-        if sensor is None:
-            return torch.zeros_like(position[..., 0], dtype=torch.bool), position, 0.0
-        there = observation["position_fix_mask"] > 0
-        z, there = usable(observation["position_fix"].double().unsqueeze(-2), there)
-        fix, fixed = z[..., 0, :], there[..., 0]
-        return fixed, torch.where(fixed.unsqueeze(-1), fix, position), sensor.std**2
+    def _pair_variance(self, at: Predicted) -> Float64[Tensor, "B N N"]:
+        """Of the vectors between the priors (m² per axis)."""
+        if at.joint.shape[-1]:
+            return joint.pair_variance(at.joint)
+        return at.variance.unsqueeze(-1) + at.variance.unsqueeze(-2)
 
-    def _links(
+    def decay_rate(
         self,
-        observation: Observation,
-        before: Delays,
-        factor: Float64[Tensor, "B N"],
-        fixed: Bool[Tensor, "B N"],
-        dt: Float64[Tensor, "B N"],
-    ) -> tuple[Links, Delays]:
-        """The step's links, their delays taken off as far as they are known, and the delays."""
-        links = links_of(observation)
-        if self.clock is None:
-            return links, before
-        after = delays.predict(before, factor, fixed, dt, self.clock)
-        distance = links.distance - delays.offsets(after.delay)
-        return Links(torch.where(links.mask, distance, 0.0), links.mask), after
-
-    def _window(
-        self,
-        belief: SwarmBelief,
-        prior: Float64[Tensor, "B N d"],
-        factor: Float64[Tensor, "B N"],
         noise: Float64[Tensor, "B N"],
         fixed: Bool[Tensor, "B N"],
-        fix_variance: float,
         dt: Float64[Tensor, "B N"],
-    ) -> RangeWindow | None:
+    ) -> float | Float64[Tensor, "B 1"]:
+        """λ of w(τ) = exp(−λ (t − τ)) in 1/s, in a step with this process ``noise`` (m²)."""
+        return self.decay
+
+    def _window(self, belief: SwarmBelief, at: Predicted) -> RangeWindow | None:
         """The window of past steps, moved on to the present."""
         if not self.window:
             return None
         return window.predict(
             belief.window,
-            prior - belief.state[..., : self.process.dim],
-            factor.masked_fill(fixed, 0.0),
-            noise.masked_fill(fixed, fix_variance),
-            window.fading(self.decay, dt),
+            at.prior - belief.state[..., : self.process.dim],
+            at.factor.masked_fill(at.fixed, 0.0),
+            at.process_noise.masked_fill(at.fixed, at.fix_variance),
+            window.fading(self.decay_rate(at.process_noise, at.fixed, at.dt), at.dt),
         )
 
 

@@ -54,6 +54,18 @@ class JointGaussNewton(SwarmFilter):
             residual = residual - clocks.offsets(delay)
         weight, _ = self.weights_at(residual, inputs)
         weight = self.confidence.information(weight, inputs)
+        return self.with_covariance(inputs, precision, position, delay, weight)
+
+    def with_covariance(
+        self,
+        inputs: StepInput,
+        precision: Float64[Tensor, "B K K"],
+        position: Float64[Tensor, "B N d"],
+        delay: Float64[Tensor, "B N 2"],
+        weight: Float64[Tensor, "B N N"],
+    ) -> Solution:
+        """The solution at this ``position`` and with this correction of the delays (m), for ranges
+        of this information (1/m²)."""
         information = information_matrix(position, weight, self.clock is not None)
         d, size = self.process.dim, precision.shape[-1]
         fixed = fixed_coordinates(inputs.fixed, d, size)

@@ -9,25 +9,42 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from agents.models.measurements import Measurement, no_neighbours
-from agents.models.measurements.vectors import Heights, Slowness
+from agents.models.measurements import (
+    BodyVelocities,
+    Heights,
+    PositionFixes,
+    RangeDifferences,
+    Slowness,
+    make_measurements,
+    no_neighbours,
+)
 from agents.models.process import Process
 from agents.models.update import information, posterior
 from agents.robust import Trust
 from agents.swarm.marginals import regular
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Height, SlowFlight
+from coloc_env.sensors import PositionFix
+
+_OWN = (Heights, Slowness, BodyVelocities, RangeDifferences, PositionFixes)
+
+
+def all_have_fixes(believed: Believed) -> bool:
+    """Whether position fixes are measurements that everybody has, and do not make some UAVs
+    anchors."""
+    fixes = believed.sensor(PositionFix)
+    return fixes is not None and fixes.count >= believed.arena.n_uavs
 
 
 class NavigationFilter:
-    """A Kalman filter for each UAV: motion model, height and slow flight."""
+    """A Kalman filter for each UAV: motion model, height, slow flight, optical flow, time
+    differences, and position fixes that everybody has."""
 
     def __init__(self, believed: Believed, process: Process) -> None:
         self.process = process
-        height, slow = believed.sensor(Height), believed.sensor(SlowFlight)
-        self.models: list[Measurement] = [Heights(height)] if height else []
-        self.models += [Slowness(slow)] if slow else []
+        kinds = _OWN if all_have_fixes(believed) else _OWN[:-1]
+        own = [model for model in make_measurements(believed) if isinstance(model, kinds)]
+        self.models = sorted(own, key=lambda model: _OWN.index(type(model)))
 
     def predict(
         self,

@@ -141,6 +141,8 @@ def descent(y: Float64[Tensor, "B N d"], window: RangeWindow) -> Float64[Tensor,
     return along_links(then, strength, length).sum(1)
 
 
-def fading(decay: float, dt: Float64[Tensor, "B N"]) -> Float64[Tensor, "B 1"]:
+def fading(
+    decay: float | Float64[Tensor, "B 1"], dt: Float64[Tensor, "B N"]
+) -> Float64[Tensor, "B 1"]:
     """The factor exp(−λ dt) of w(τ) in a step, λ in 1/s (equation 15)."""
     return torch.exp(-decay * dt[:, :1])

@@ -17,6 +17,7 @@ TASKS = Registry(
     "task",
     "coloc.tasks",
     {
+        "active-v0": "agents.tasks.active:Active",
         "beacon-hard-v0": "agents.tasks.beacon:BeaconHard",
         "beacon-v0": "agents.tasks.beacon:Beacon",
         "convoy-hard-v0": "agents.tasks.convoy:ConvoyHard",
@@ -41,10 +42,8 @@ def make_task(name: str, **chosen: Any) -> Task:
     name, *texts = name.split(":")
     factory = TASKS.require(name)
     known = options.of(factory)
-    for text in texts:
-        key, value = options.parse(name, text, known)
-        chosen[key] = value
-    made: Task = factory(**options.grouped(factory, options.checked(name, chosen, known)))
+    chosen = options.checked(name, options.parse_all(name, texts, known, chosen), known)
+    made: Task = factory(**options.grouped(factory, chosen))
     return made
 
 

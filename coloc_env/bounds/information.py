@@ -3,8 +3,9 @@
 Information matrices are over pose errors (δp in m, world; δθ in rad, right: R exp(δθ)), D = 6 in
 space and 3 in the plane. ``truth`` is [B, N, …]; the masks of ``seen`` mark which measurements
 arrived in just this world and step, and their values are never looked at. A modality is one
-function here: ``own_information`` [B, N, D, D] for what one UAV measures of the world, or
-``shared_information`` [B, N, D, N, D] for what ties two UAVs together.
+function here: ``own_information`` [B, N, D, D] for what one UAV measures of the world,
+``motion_information`` [B, N, D + d, D + d] for what it measures of its velocity, too (δv in m/s,
+world, after the pose), or ``shared_information`` [B, N, D, N, D] for what ties two UAVs together.
 
 For z = h(x) + noise each contributes Hᵀ R⁻¹ H (Kay 1993, eq. 3.31), R the *true* noise.
 """
@@ -23,14 +24,18 @@ from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
 from coloc_env.sensors import (
     AnchorRanging,
+    ArrivalAngles,
     Height,
     LandmarkBearings,
     Landmarks,
+    OpticalFlow,
     PositionFix,
     Ranging,
     Sensor,
+    Tdoa,
     UavBearings,
 )
+from coloc_env.sensors.angles import angles_by_vector
 from coloc_env.sensors.ranging import Tags, tag_positions
 
 
@@ -40,6 +45,20 @@ def own_information(
 ) -> Float64[Tensor, "B N D D"]:
     """Information of a sensor that measures the world, about each UAV's own pose."""
     raise NotImplementedError(f"bounds: no Fisher information is known for {type(sensor).__name__}")
+
+
+@singledispatch
+def motion_information(
+    sensor: Sensor, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N M M"]:
+    """Information of a sensor that measures a UAV's velocity, about its pose and velocity."""
+    raise NotImplementedError(f"bounds: no Fisher information is known for {type(sensor).__name__}")
+
+
+def informs_of_motion(sensor: Sensor) -> bool:
+    """Whether a sensor's information is about the velocity, too."""
+    unknown = motion_information.dispatch(object)
+    return motion_information.dispatch(type(sensor)) is not unknown
 
 
 @singledispatch
@@ -111,14 +130,28 @@ def anchor_rows(
 
 
 @own_information.register
+def _tdoa(sensor: Tdoa, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """z = ‖t − A_n‖ − ‖t − A_m‖ + N(0, σ²), t = p + R l: by t it changes as u_n − u_m."""
+    shape = (sensor.depth, sensor.n_tags, -1)
+    count = _mask(seen, "tdoa_mask").unflatten(-1, shape).sum(-3)  # [B, N, T, P]
+    tags, jacobian = _tags(truth, sensor.tags)
+    unit = _unit(tags.unsqueeze(-2) - _points(seen, "tdoa_map", truth).unsqueeze(2))
+    m, n = sensor.ends
+    rows = (unit[..., n, :] - unit[..., m, :]) @ jacobian
+    weights = count / max(sensor.std, EXACT) ** 2
+    return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
+
+
+@own_information.register
 def _position_fix(
     sensor: PositionFix, truth: Kinematics, seen: Observation
 ) -> Float64[Tensor, "B N D D"]:
-    """z = p + N(0, σ² I)."""
+    """z = p + N(0, diag σ²)."""
     dim = truth.position.shape[-1]
     pose = torch.eye(dim, 6 if dim == 3 else 3, dtype=torch.float64, device=truth.position.device)
-    rows = pose.expand(*truth.position.shape[:2], 1, -1, -1)
-    return _gram(rows, _mask(seen, "position_fix_mask") / max(sensor.std, EXACT) ** 2)
+    rows = pose.unsqueeze(1).expand(*truth.position.shape[:2], -1, -1, -1)
+    variance = pose.new_tensor([max(std, EXACT) ** 2 for std in sensor.axis_std(dim)])
+    return _gram(rows, _mask(seen, "position_fix_mask") / variance)
 
 
 @own_information.register
@@ -127,6 +160,17 @@ def _height(sensor: Height, truth: Kinematics, seen: Observation) -> Float64[Ten
     row = truth.position.new_zeros(*truth.position.shape[:2], 1, 1, 6)
     row[..., 2] = 1.0
     return _gram(row, _mask(seen, "height_mask") / max(sensor.std, EXACT) ** 2)
+
+
+@motion_information.register
+def _flow(sensor: OpticalFlow, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N 9 9"]:
+    """z = (Rᵀ v)_xy + N(0, σ² I)."""
+    rotation = rotation_matrix(truth.attitude)
+    velocity = (truth.velocity.unsqueeze(-2) @ rotation).squeeze(-2)
+    rows = velocity.new_zeros(*velocity.shape[:2], 1, 2, 9)
+    rows[..., 0, :, 3:6] = _turn(velocity)[..., :2, :]
+    rows[..., 0, :, 6:9] = rotation.mT[..., :2, :]
+    return _gram(rows, _mask(seen, "flow_mask") / max(sensor.std, EXACT) ** 2)
 
 
 # ---------------------------------------------------------------- what ties two UAVs together
@@ -176,19 +220,42 @@ def _uav_bearings(
     sensor: UavBearings, truth: Kinematics, seen: Observation
 ) -> Float64[Tensor, "B N D N D"]:
     """Range and bearing of R_iᵀ(p_j − p_i), each end measuring for itself."""
-    arrived = _mask(seen, "uav_bearing_mask").unflatten(-1, (sensor.depth, -1)).sum(-2)
-    weights = _by_uav(arrived.unsqueeze(-1), seen).squeeze(-1)
-    n = weights.shape[1]
-    apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, n, -1, -1))
-    polar = _polar_jacobian(apart, sensor.range_std, sensor.bearing_std)
-    own = polar @ own
+    weights = _seen_of_others(seen, "uav_bearing_mask", sensor.depth)
+    apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, len(weights[0]), -1, -1))
+    return _of_directions(
+        _polar_jacobian(apart, sensor.range_std, sensor.bearing_std) @ own, weights
+    )
+
+
+@shared_information.register
+def _arrival_angles(
+    sensor: ArrivalAngles, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D N D"]:
+    """Azimuth and elevation of R_iᵀ(p_j − p_i), each end measuring for itself."""
+    weights = _seen_of_others(seen, "arrival_angle_mask", sensor.depth)
+    apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, len(weights[0]), -1, -1))
+    std = own.new_tensor((sensor.azimuth_std, sensor.elevation_std)).clamp_min(EXACT)
+    return _of_directions(angles_by_vector(apart) / std.unsqueeze(-1) @ own, weights)
+
+
+def _of_directions(
+    own: Float64[Tensor, "B N N k D"], weights: Float64[Tensor, "B N N"]
+) -> Float64[Tensor, "B N D N D"]:
+    """Information of what depends on R_iᵀ(p_j − p_i), by its derivatives by i's pose."""
+    d = 3 if own.shape[-1] == 6 else 2
     other = torch.zeros_like(own)
-    other[..., :2] = -own[..., :2]  # only p_j − p_i matters, and the other's heading not at all
+    other[..., :d] = -own[..., :d]  # only p_j − p_i matters, and the other's attitude not at all
     between = torch.einsum("bijxd,bij,bijxe->bidje", own, weights, other)
     joint = between + between.permute(0, 3, 4, 1, 2)
     ends = _gram(own, weights) + _gram(other.transpose(1, 2), weights.transpose(1, 2))
     joint.diagonal(dim1=1, dim2=3).add_(ends.movedim(1, -1))
     return joint
+
+
+def _seen_of_others(seen: Observation, mask: str, depth: int) -> Float64[Tensor, "B N N"]:
+    """How often each UAV measured each other one."""
+    arrived = _mask(seen, mask).unflatten(-1, (depth, -1)).sum(-2)
+    return _by_uav(arrived.unsqueeze(-1), seen).squeeze(-1)
 
 
 # ---------------------------------------------------------------- parts

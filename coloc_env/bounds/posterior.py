@@ -40,6 +40,7 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.bounds.biases import LinkBiases, updated
 from coloc_env.bounds.expected import expected_information
+from coloc_env.bounds.information import informs_of_motion
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
 from coloc_env.bounds.worlds import seeds_of, worlds
@@ -118,6 +119,7 @@ def _bound(
     n = scenario.arena.n_uavs if cooperative else 1
     states = (len(seeds), scenario.arena.n_uavs, pose.shape[1])
     sensors = [s for s in true_sensors(scenario) if cooperative or not s.between_uavs]
+    velocity = model.velocity() if any(map(informs_of_motion, sensors)) else None
     prior = torch.block_diag(*n * [prior_covariance(model, scenario)], biases.prior)
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
     size = n * states[2]  # of a team's errors; its biases follow
@@ -132,7 +134,7 @@ def _bound(
         keys = noise.fold(noise.row_keys(seeds), step)
         white = noise.normal(keys, "bound", states[1] * states[2]).double()
         drawn = (2**0.5 * root[:, :size, :size] @ white.reshape(len(root), -1, 1)).view(states)
-        own, shared = expected_information(sensors, truth, seen, drawn, pose)
+        own, shared = expected_information(sensors, truth, seen, drawn, pose, velocity)
         if biases.count:
             about = biases.information(truth, seen, drawn, pose, n)
             covariance = updated(root, _by_team(own, n), shared, about)

@@ -53,6 +53,11 @@ class ErrorModel(ABC):
         """What takes a state error to the pose error (δp, δθ) that sensors see; an attitude that is
         no state counts as known."""
 
+    def velocity(self) -> Float64[Tensor, "d E"]:
+        """What takes a state error to that of the velocity (m/s)."""
+        motion = type(self).__name__.removesuffix("Errors")
+        raise NotImplementedError(f"bounds: velocity is no state of {motion} motion")
+
 
 @dataclass(frozen=True)
 class InertialErrors(ErrorModel):
@@ -88,6 +93,9 @@ class InertialErrors(ErrorModel):
 
     def pose(self) -> Float64[Tensor, "D E"]:
         return torch.eye(15 if self.biased else 9, dtype=torch.float64)[[0, 1, 2, 6, 7, 8]]
+
+    def velocity(self) -> Float64[Tensor, "d E"]:
+        return torch.eye(15 if self.biased else 9, dtype=torch.float64)[3:6]
 
 
 @dataclass(frozen=True)
@@ -205,6 +213,9 @@ class ConstantVelocityErrors(ErrorModel):
         pose = torch.zeros(6 if self.dim == 3 else 3, 2 * self.dim, dtype=torch.float64)
         pose[: self.dim, : self.dim] = torch.eye(self.dim)
         return pose
+
+    def velocity(self) -> Float64[Tensor, "d E"]:
+        return torch.eye(2 * self.dim, dtype=torch.float64)[self.dim :]
 
 
 def error_model(scenario: Scenario) -> ErrorModel:

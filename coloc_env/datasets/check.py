@@ -167,7 +167,7 @@ def _about_imu(recording: Recording) -> list[tuple[int, str]]:
 def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     """Robots whose place nothing shows, and maps that leave a mirror image."""
     fixed = {
-        "anchor_ranges", "landmark_bearings", "landmark_vectors", "position_fix"
+        "anchor_ranges", "landmark_bearings", "landmark_vectors", "position_fix", "tdoa"
     } & recording.streams.keys()  # fmt: skip
     reached = {
         robot
@@ -176,7 +176,7 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     }
     ties = [
         (robot, int(other))
-        for stream, column in (("uav_ranges", 1), ("uav_bearings", 0))
+        for stream, column in (("uav_ranges", 1), ("uav_bearings", 0), ("arrival_angles", 0))
         for robot, table in enumerate(recording.streams.get(stream, ()))
         for other in np.unique(table.values[:, column])
     ]

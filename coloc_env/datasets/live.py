@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from coloc_env.datasets.grid import LINKS, Usual
 from coloc_env.datasets.noise_model import NoiseModel, corrected, stream_corrections
@@ -38,6 +39,9 @@ _COLUMNS = {
     "landmark_vectors": ("landmark", "x", "y", "z"),
     "uav_ranges": ("own_tag", "robot", "tag", "range"),
     "anchor_ranges": ("own_tag", "anchor", "range"),
+    "tdoa": ("own_tag", "from", "to", "difference"),
+    "arrival_angles": ("robot", "azimuth", "elevation"),
+    "flow": ("vx", "vy"),
     "height": ("height",),
     "position_fix": ("x", "y", "z"),
 }
@@ -197,6 +201,27 @@ class LiveSamples:
         for stream in self.times:
             self.times[stream] = [[] for _ in self.about.robots]
             self.rows[stream] = [[] for _ in self.about.robots]
+
+    def state(self) -> dict[str, list[dict[str, Any]]]:
+        """All samples, as ``restore`` takes them: by stream and robot, ``times`` (ns) and ``rows``
+        [n, F]."""
+        return {
+            stream: [
+                {"times": times, "rows": torch.from_numpy(np.array(rows))}
+                for times, rows in zip(team, self.rows[stream], strict=True)
+            ]
+            for stream, team in self.times.items()
+        }
+
+    def restore(self, state: Mapping[str, Sequence[Mapping[str, Any]]]) -> int | None:
+        """Hold the samples of a ``state``, and no others; the newest stamp, ns."""
+        self.clear()
+        for stream, team in state.items():
+            for robot, found in enumerate(team):
+                for time, row in zip(found["times"], found["rows"].numpy(), strict=True):
+                    self.insert((stream, robot, time, row))
+        every = [times[-1] for team in self.times.values() for times in team if times]
+        return max(every, default=None)
 
     # ---------------------------------------------------------------- out
 

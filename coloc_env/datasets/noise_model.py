@@ -103,6 +103,46 @@ class ScalarModel:
 
 
 @dataclass(frozen=True)
+class HeightModel(ScalarModel):
+    """Heights; of a barometer a ``drift``, too: the standard deviation (m) of a bias that filters
+    estimate, whose correlation falls by e in ``drift_time`` s (0: none)."""
+
+    drift: float = 0.0
+    drift_time: float = 300.0
+
+
+@dataclass(frozen=True)
+class FixModel(ScalarModel):
+    """Position fixes: ``std`` m of each axis, or of the horizontal ones where there is a
+    ``vertical_std`` m (0: none)."""
+
+    std: float = 1.0
+    vertical_std: float = 0.0
+
+
+@dataclass(frozen=True)
+class TdoaModel:
+    """Time differences of arrival: ``std`` m."""
+
+    std: float = 0.15
+
+
+@dataclass(frozen=True)
+class AngleModel:
+    """Angles of arrival: standard deviations, rad."""
+
+    azimuth_std: float = 0.05
+    elevation_std: float = 0.05
+
+
+@dataclass(frozen=True)
+class FlowModel:
+    """Optical flow: ``std`` m/s."""
+
+    std: float = 0.1
+
+
+@dataclass(frozen=True)
 class MotionModel:
     """``model``: one of ``MODELS``, or ``auto`` (by what the recording has). Of a constant
     velocity: white acceleration ``accel_std`` (m/s²/√Hz), ``damping`` s (0: none). ``slow_flight``:
@@ -127,8 +167,11 @@ class NoiseModel:
     landmark_bearings: BearingModel = BearingModel()
     uav_bearings: BearingModel = BearingModel()
     landmark_vectors: ScalarModel = ScalarModel()
-    height: ScalarModel = ScalarModel()
-    position_fix: ScalarModel = ScalarModel(1.0)
+    tdoa: TdoaModel = TdoaModel()
+    arrival_angles: AngleModel = AngleModel()
+    flow: FlowModel = FlowModel()
+    height: HeightModel = HeightModel()
+    position_fix: FixModel = FixModel()
     anchors: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     tags: Mapping[str, tuple[tuple[float, ...], ...]] = field(default_factory=dict)
 
@@ -268,6 +311,8 @@ def _built(
                 file.fail(at, f"{value:g} is not 0 or more")
             if abs(value) > 1e6 or (name == "delay" and abs(value) > 60):
                 file.fail(at, f"{value:g} is beyond all measure")
+            if name == "drift_time" and value == 0:
+                file.fail(at, "0 is no time")
             if name in ("scale", "turn_scale") and not 0.01 < value < 100:
                 file.fail(at, f"{value:g} is no scale from 0.01 to 100")
             found[name] = value

@@ -107,6 +107,9 @@ class Recording:
     - ``uav_bearings``: robot (index), range m, bearing rad
     - ``uav_ranges``: own_tag, robot, tag (indices), range m; each exchange in both ends' tables
     - ``anchor_ranges``: own_tag, anchor (indices), range m
+    - ``tdoa``: own_tag, from, to (indices of anchors), difference m: how much farther ``to`` is
+    - ``arrival_angles``: robot (index), azimuth rad (counter-clockwise), elevation rad; body frame
+    - ``flow``: vx, vy m/s in the body frame
     - ``height``: height m above the world's origin
     - ``magnetometer``: x, y, z tesla, body frame
     - ``landmark_vectors``, ``uav_vectors``: landmark or robot (index), x, y, z m in the body frame

@@ -126,7 +126,7 @@ def recorded_imu(
     leaf[..., :3] -= bias[:, 3:]
     series = {"imu": Series(torch.from_numpy(leaf).to(torch.float32))}
     if np.any(unknown):
-        series["imu_unknown"] = _series(unknown)
+        series["imu_unknown"] = as_series(unknown)
     return RecordedImu(sensor, series)
 
 
@@ -147,7 +147,7 @@ def recorded_imu_samples(
         samples.append(np.pad(forces, (*pad, (0, 0))).reshape(grid.count, -1))
         durations.append(np.pad(lasting, pad))
     mean = recorded_imu(recording, grid, sensor, bias).series
-    whole = {"imu_samples": _series(samples), "imu_held": _series(durations)}
+    whole = {"imu_samples": as_series(samples), "imu_held": as_series(durations)}
     return RecordedImu(sensor, mean | whole)
 
 
@@ -179,9 +179,9 @@ def recorded_odometry(
         sideways = spread[1] if len(spread) == 3 else 0.0
         robots.append(odometry_on(grid, whole))
         unknown.append(unknown_on(grid, missing, np.array((spread[0], sideways, spread[-1]))))
-    series = {"odometry": _series(robots)}
+    series = {"odometry": as_series(robots)}
     if np.any(unknown):
-        series["odometry_unknown"] = _series(unknown)
+        series["odometry_unknown"] = as_series(unknown)
     return RecordedOdometry(sensor, series)
 
 
@@ -203,8 +203,8 @@ def recorded_bearings(
     values = [np.pad(v, (*p, (0, 0))) for v, p in zip(values, pad, strict=True)]
     there = [np.pad(m, p) for m, p in zip(there, pad, strict=True)]
     series = {
-        f"{name}s": _series([v.reshape(grid.count, -1) for v in values]),
-        f"{name}_mask": _series([m.reshape(grid.count, -1) for m in there]),
+        f"{name}s": as_series([v.reshape(grid.count, -1) for v in values]),
+        f"{name}_mask": as_series([m.reshape(grid.count, -1) for m in there]),
     }
     maps = {}
     if to_landmarks:
@@ -244,7 +244,7 @@ def recorded_anchor_ranges(
 
 def recorded_height(recording: Recording, grid: Grid, sensor: Height) -> RecordedSensor:
     """Leaves ``height`` and ``height_mask``: the newest sample of each step."""
-    return _newest(recording, grid, sensor, "height")
+    return newest(recording, grid, sensor, "height")
 
 
 def recorded_landmarks(recording: Recording, grid: Grid, sensor: Landmarks) -> RecordedSensor:
@@ -255,8 +255,8 @@ def recorded_landmarks(recording: Recording, grid: Grid, sensor: Landmarks) -> R
     return RecordedSensor(
         sensor,
         {
-            "landmarks": _series([each.reshape(grid.count, -1) for each in values]),
-            "landmark_mask": _series(there),
+            "landmarks": as_series([each.reshape(grid.count, -1) for each in values]),
+            "landmark_mask": as_series(there),
         },
         {"landmark_map": torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)},
         {"landmark_vectors": recording.dropped.get("landmark_vectors", 0)},
@@ -265,7 +265,7 @@ def recorded_landmarks(recording: Recording, grid: Grid, sensor: Landmarks) -> R
 
 def recorded_fixes(recording: Recording, grid: Grid, sensor: PositionFix) -> RecordedSensor:
     """Leaves ``position_fix`` and ``position_fix_mask``: the newest sample of each step."""
-    return _newest(recording, grid, sensor, "position_fix")
+    return newest(recording, grid, sensor, "position_fix")
 
 
 def lever_arms(recording: Recording) -> tuple[tuple[tuple[float, ...], ...], ...]:
@@ -275,14 +275,14 @@ def lever_arms(recording: Recording) -> tuple[tuple[tuple[float, ...], ...], ...
     return tuple(tuple(tuple(arm) for arm in robot) for robot in recording.tags.tolist())
 
 
-def _newest(recording: Recording, grid: Grid, sensor: Sensor, stream: str) -> RecordedSensor:
+def newest(recording: Recording, grid: Grid, sensor: Sensor, stream: str) -> RecordedSensor:
     """A stream's own leaf and its mask, with the newest sample of each step."""
     tables = [last_on(grid, table) for table in recording.streams[stream]]
     return RecordedSensor(
         sensor,
         {
-            stream: _series([values for values, _ in tables]),
-            f"{stream}_mask": _series([there[:, None] for _, there in tables]),
+            stream: as_series([values for values, _ in tables]),
+            f"{stream}_mask": as_series([there[:, None] for _, there in tables]),
         },
         dropped={stream: recording.dropped.get(stream, 0)},
     )
@@ -297,7 +297,7 @@ def _ranges(
     columns: slice,
 ) -> tuple[Series, Series]:
     values, there = _once(recording, grid, stream, slots, count, columns)
-    return _series([each[..., 0] for each in values]), _series(there)
+    return as_series([each[..., 0] for each in values]), as_series(there)
 
 
 def _once(
@@ -323,7 +323,7 @@ def _once(
     return values, there
 
 
-def _series(robots: Sequence[np.ndarray]) -> Series:
+def as_series(robots: Sequence[np.ndarray]) -> Series:
     """One leaf of all robots, [T, N, F] float32."""
     stacked: Tensor = torch.from_numpy(np.stack(robots, 1)).to(torch.float32)
     return Series(stacked)

@@ -3,9 +3,9 @@
 from coloc_env.scenarios.registry import (
     SCENARIOS,
     make_scenario,
-    parse_override,
+    parse_overrides,
     parse_scenario,
     scenario_from,
 )
 
-__all__ = ["SCENARIOS", "make_scenario", "parse_override", "parse_scenario", "scenario_from"]
+__all__ = ["SCENARIOS", "make_scenario", "parse_overrides", "parse_scenario", "scenario_from"]

@@ -11,12 +11,17 @@ from coloc_env.scenario import (
     Scenario,
     TeamOptions,
 )
-from coloc_env.scenarios.parts.anchors import AnchorOptions
+from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions
 from coloc_env.sensors import (
+    AngleOptions,
+    BarometerOptions,
+    FlowOptions,
+    GnssOptions,
     LandmarkOptions,
     Ranging,
     Sensor,
     SimulatedImuOptions,
+    TagOptions,
     UavRangeOptions,
 )
 
@@ -33,6 +38,12 @@ def indoor(
     landmarks: LandmarkOptions = LandmarkOptions(),
     ranges: UavRangeOptions = UavRangeOptions(),
     anchors: AnchorOptions = AnchorOptions(),
+    tags: TagOptions = TagOptions(),
+    tdoa: TdoaOptions = TdoaOptions(),
+    angles: AngleOptions = AngleOptions(),
+    gnss: GnssOptions = GnssOptions(),
+    flow: FlowOptions = FlowOptions(),
+    barometer: BarometerOptions = BarometerOptions(),
     imu: SimulatedImuOptions = SimulatedImuOptions(),
     network: WalledNetworkOptions = WalledNetworkOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
@@ -56,12 +67,17 @@ def indoor(
         process = Inertial(imu.accel_bias, imu.gyro_bias) if imu.estimated else Inertial()
     true += landmarks.true
     believed += landmarks.believed
+    arms = tags.arms(team.n_uavs)
     if uwb:
-        true.append(Ranging(ranges.true, latency=ranges.uwb_delay))
-        believed.append(Ranging(ranges.believed, latency=ranges.uwb_delay))
+        true.append(Ranging(ranges.true, arms, ranges.uwb_delay))
+        believed.append(Ranging(ranges.believed, arms, ranges.uwb_delay))
     if anchors.anchors:
-        true.append(anchors.true(room, ranges.true))
-        believed.append(anchors.believed(room, ranges.believed))
+        true.append(anchors.true(room, ranges.true, arms))
+        believed.append(anchors.believed(room, ranges.believed, arms))
+    others = (*tdoa.true(room, arms), *angles.true, *gnss.true(team.n_uavs))
+    others = (*others, *flow.true, *barometer.true)
+    true += others
+    believed += others
     return Scenario(
         name="indoor-v0",
         arena=arena,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -58,12 +59,15 @@ def scenario_from(scenario: str | Scenario, overrides: dict[str, Any]) -> Scenar
     return scenario
 
 
-def parse_scenario(text: str) -> Scenario:
-    """A scenario with overrides as on a command line: ``indoor-v0:nlos=0.3:horizon=200``."""
-    name, *overrides = text.split(":")
-    return make_scenario(name, **dict(parse_override(name, one) for one in overrides))
+def parse_scenario(text: str, variant: str = "") -> Scenario:
+    """A scenario with overrides as on a command line: ``indoor-v0:nlos=0.3:horizon=200``; those of
+    a ``variant`` (``nlos=0.1:landmarks=5``) take the place of these."""
+    name, *own = text.split(":")
+    others = variant.split(":") if variant else ()
+    return make_scenario(name, **parse_overrides(name, own) | parse_overrides(name, others))
 
 
-def parse_override(name: str, text: str) -> tuple[str, Any]:
-    """``key=value`` from a command line, the value read as the override's type."""
-    return options.parse(name, text, SCENARIOS.options_of(name))
+def parse_overrides(name: str, texts: Iterable[str]) -> dict[str, Any]:
+    """``key=value`` from a command line, each value read as the override's type. Raises ValueError
+    for one that does not fit, or is given twice."""
+    return options.parse_all(name, texts, SCENARIOS.options_of(name))

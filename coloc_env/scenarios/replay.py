@@ -10,6 +10,12 @@ from typing import Literal
 import numpy as np
 
 from coloc_env.datasets import Recording
+from coloc_env.datasets.carried import (
+    believed_tdoa,
+    recorded_angles,
+    recorded_flow,
+    recorded_tdoa,
+)
 from coloc_env.datasets.folders import Version, expanded, version
 from coloc_env.datasets.grid import Grid, Usual, aligned, common_grid, usual
 from coloc_env.datasets.noise_model import NoiseModel, corrected, read_noise_model
@@ -43,11 +49,13 @@ from coloc_env.scenario import (
 from coloc_env.scenarios.parts.replays import OwnReplayOptions
 from coloc_env.sensors import (
     AnchorRanging,
+    ArrivalAngles,
     Height,
     Imu,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    OpticalFlow,
     PositionFix,
     RangeNoise,
     Ranging,
@@ -203,11 +211,23 @@ def _sensors(recording: Recording, model: NoiseModel) -> dict[str, Make]:
         places = tuple(map(tuple, recording.landmarks.tolist()))
         vectors = Landmarks(count, std, radius=1e4, positions=places)
         makers["landmark_vectors"] = lambda r, g: (recorded_landmarks(r, g, vectors), vectors)
+    if "tdoa" in recording.streams:
+        tdoa = believed_tdoa(recording, model.tdoa.std, tags)
+        makers["tdoa"] = lambda r, g: recorded_tdoa(r, g, tdoa)
+    if "arrival_angles" in recording.streams:
+        heard = ArrivalAngles(model.arrival_angles.azimuth_std, model.arrival_angles.elevation_std)
+        makers["arrival_angles"] = lambda r, g: recorded_angles(r, g, heard)
+    if "flow" in recording.streams:
+        flow = OpticalFlow(model.flow.std)
+        makers["flow"] = lambda r, g: (recorded_flow(r, g, flow), flow)
     if "height" in recording.streams:
-        height = Height(model.height.std)
+        own_height = model.height
+        drift = (own_height.drift, own_height.drift_time)
+        height = Height(own_height.std, 0.0, *drift, estimated=bool(own_height.drift))
         makers["height"] = lambda r, g: (recorded_height(r, g, height), height)
     if "position_fix" in recording.streams:
-        fix = PositionFix(model.position_fix.std, len(recording.robots))
+        upwards = model.position_fix.vertical_std or None
+        fix = PositionFix(model.position_fix.std, len(recording.robots), upwards)
         makers["position_fix"] = lambda r, g: (recorded_fixes(r, g, fix), fix)
     return makers
 

@@ -1,27 +1,35 @@
 """Sensors: what each UAV measures of the truth."""
 
+from coloc_env.sensors.angles import AngleOptions, ArrivalAngles
 from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
 from coloc_env.sensors.displacement import Displacement
 from coloc_env.sensors.errors.clock import Clock
 from coloc_env.sensors.errors.range_noise import NlosKind, RangeNoise, RangeOptions
-from coloc_env.sensors.height import Height
+from coloc_env.sensors.height import BarometerOptions, Height
 from coloc_env.sensors.imu import GRAVITY, Imu, ImuOptions, RecordedImu, SimulatedImuOptions
 from coloc_env.sensors.ins import Ins, InsOptions
 from coloc_env.sensors.landmarks import LandmarkOptions, Landmarks
 from coloc_env.sensors.odometry import Odometry, RecordedOdometry
-from coloc_env.sensors.position_fix import AnchorUavOptions, PositionFix
-from coloc_env.sensors.ranging import AnchorRanging, Ranging, UavRangeOptions
+from coloc_env.sensors.optical_flow import FlowOptions, OpticalFlow
+from coloc_env.sensors.position_fix import AnchorUavOptions, GnssOptions, PositionFix
+from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRangeOptions
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
 from coloc_env.sensors.slow_flight import SlowFlight
+from coloc_env.sensors.tdoa import Tdoa
 
 __all__ = [
     "GRAVITY",
     "AnchorRanging",
     "AnchorUavOptions",
+    "AngleOptions",
+    "ArrivalAngles",
+    "BarometerOptions",
     "Clock",
     "Displacement",
+    "FlowOptions",
+    "GnssOptions",
     "Height",
     "Imu",
     "ImuOptions",
@@ -34,6 +42,7 @@ __all__ = [
     "Leaf",
     "NlosKind",
     "Odometry",
+    "OpticalFlow",
     "PositionFix",
     "RangeNoise",
     "RangeOptions",
@@ -48,6 +57,8 @@ __all__ = [
     "Sensor",
     "SimulatedImuOptions",
     "SlowFlight",
+    "TagOptions",
+    "Tdoa",
     "UavBearings",
     "UavRangeOptions",
     "Window",

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -11,7 +12,7 @@ from coloc_env import noise
 from coloc_env.geometry import rotate
 from coloc_env.geometry.walls import depth
 from coloc_env.motion import Box, Kinematics
-from coloc_env.options import Count
+from coloc_env.options import Count, Group, Metres, PositiveCount
 from coloc_env.sensors.base import (
     MASK,
     Layout,
@@ -138,6 +139,25 @@ class UavRangeOptions(RangeOptions):
     """Ranges between UAVs arrive ``uwb_delay`` steps after they were measured."""
 
     uwb_delay: Count = 0
+
+
+@dataclass(frozen=True)
+class TagOptions(Group):
+    """Each UAV carries so many UWB ``tags``, evenly around it in its own plane from forward on,
+    ``tag_arm`` m from its position."""
+
+    title: ClassVar[str] = "UWB tags"
+
+    tags: PositiveCount = 1
+    tag_arm: Metres = 0.0
+
+    def arms(self, n_uavs: int) -> Tags:
+        """Lever arms (m, body frame) of all UAVs in space; nothing for one tag at the position."""
+        if self.tags == 1 and not self.tag_arm:
+            return ()
+        turns = [2 * math.pi * i / self.tags for i in range(self.tags)]
+        own = tuple((self.tag_arm * math.cos(t), self.tag_arm * math.sin(t), 0.0) for t in turns)
+        return (own,) * n_uavs
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _PAPERS = {  # what implements each paper
         "agents/particle/hybrid.py",
         "agents/particle/nnhpff.py",
     ),
-    "ST-DCL": ("agents/swarm", "agents/stdcl"),
+    "ST-DCL": ("agents/swarm", "agents/stdcl", "training/reproduce/stdcl/theory.py"),
     "CSPF": ("agents/stein",),
 }
 

@@ -1,16 +1,16 @@
 """The leaderboard: a table a task, made from the stored results of ``coloc score``."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-FOLDER = Path(__file__).parents[1] / "results" / "scores"
+from agents.tasks.leaderboard import scores
+
 _HEAD = """# Leaderboard
 
 How well policies do in the [tasks](tasks.md), on the 256 worlds of the protocol, which no training
-uses. Every row is a file of `docs/results/scores/`, as `coloc score` wrote it.
+uses. Every row is a file of `agents/tasks/scores/`, as `coloc score` wrote it; `coloc tasks` shows
+the best.
 
 ## How to submit
 
@@ -20,7 +20,7 @@ uses. Every row is a file of `docs/results/scores/`, as `coloc score` wrote it.
     coloc score survey-v0 --policy my_module:my_policy --label "My method" --out my_method.json
     ```
 
-2. Put the file into `docs/results/scores/survey-v0/` and open a pull request that links code with
+2. Put the file into `agents/tasks/scores/survey-v0/` and open a pull request that links code with
    which we can run the same command (`--link`). What cannot be run again is not listed.
 
 Policies that take `Seen.memory` read the estimator's joint belief, and so are central; those that
@@ -30,17 +30,6 @@ Returns are means over the worlds; IQM is the interquartile mean with its 95 % b
 over worlds; span is the share of the way from random actions to the best heuristic. Interaction is
 what `uav_0` loses when the others act at random; cooperation is what ranges between UAVs are worth.
 """
-
-
-def scores() -> dict[str, list[dict[str, Any]]]:
-    """Stored results by task, the best first."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for file in sorted(FOLDER.glob("*/*.json")):
-        one = json.loads(file.read_text(encoding="utf-8"))
-        found.setdefault(one["task"], []).append(one)
-    for rows in found.values():
-        rows.sort(key=lambda one: -one["return"])
-    return found
 
 
 def page() -> str:

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))  # the pages are about this c
 from agents import LOCALIZERS
 from coloc_env import SCENARIOS, make_scenario
 from coloc_env.observation import action_width, message_leaves, sensed_leaves, static_leaves
-from coloc_env.options import Option
+from coloc_env.options import Option, typed
 from coloc_env.registry import Registry
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import Leaf
@@ -55,9 +55,7 @@ def value(thing: Any) -> str:
     """A setting as it is typed on a command line, as code."""
     if thing is inspect.Parameter.empty:
         return "must be given"
-    if isinstance(thing, list | tuple):
-        return "`" + ",".join(map(str, thing)) + "`"
-    return f"`{str(thing).lower() if thing is None or isinstance(thing, bool) else thing}`"
+    return f"`{typed(thing)}`"
 
 
 def options(known: Mapping[str, Option], kind: str, level: int) -> str:

@@ -101,15 +101,15 @@ def test_steps_do_not_touch_the_global_generator(sample: SimpleNamespace) -> Non
 # ---------------------------------------------------------------- batches
 
 
-def test_a_row_of_a_batch_is_its_own_run(case: SimpleNamespace, tools: SimpleNamespace) -> None:
+def test_a_row_of_a_batch_is_its_own_run(sample: SimpleNamespace, tools: SimpleNamespace) -> None:
     """Exactly, but for sums over the team: particles would multiply any rounding by thousands."""
     summed = (
-        case.localizer.centralized or "fusion=exchange" in case.name
+        sample.localizer.centralized or "fusion=exchange" in sample.name
     )  # everybody's joint filter
     tolerance = SUMMED if summed else EXACT
     for row, seed in enumerate((3, 4)):
-        alone = tools.play(case.localizer, case.scenario, [seed], 4)
-        for one, many in zip(alone.estimates, case.run.estimates, strict=True):
+        alone = tools.play(sample.localizer, sample.scenario, [seed], 4)
+        for one, many in zip(alone.estimates, sample.run.estimates, strict=True):
             tools.assert_same(one, many[row : row + 1], tolerance)
 
 
@@ -144,18 +144,18 @@ def test_a_row_of_a_small_team_is_its_own_run(
 # ---------------------------------------------------------------- time
 
 
-def test_the_first_step_predicts_nothing(case: SimpleNamespace, tools: SimpleNamespace) -> None:
+def test_the_first_step_predicts_nothing(sample: SimpleNamespace, tools: SimpleNamespace) -> None:
     """What drives the motion model at the first observation has no step behind it."""
-    first = case.run.observations[0]
+    first = sample.run.observations[0]
     driven = {name: 7 + 3 * first[name] for name in ("imu", "odometry") if name in first}
-    rest = case.run.observations[1:]
-    changed = tools.replay(case.localizer, [tools.change(first, **driven), *rest])
-    for one, other in zip(changed.estimates, case.run.estimates, strict=True):
+    rest = sample.run.observations[1:]
+    changed = tools.replay(sample.localizer, [tools.change(first, **driven), *rest])
+    for one, other in zip(changed.estimates, sample.run.estimates, strict=True):
         tools.assert_same(one, other)
     if driven:
-        later = [first, tools.change(case.run.observations[1], **driven)]
-        moved = tools.replay(case.localizer, later).estimates[1]
-        assert not torch.equal(moved.position, case.run.estimates[1].position)
+        later = [first, tools.change(sample.run.observations[1], **driven)]
+        moved = tools.replay(sample.localizer, later).estimates[1]
+        assert not torch.equal(moved.position, sample.run.estimates[1].position)
 
 
 def test_without_measurements_the_first_estimate_is_the_prior(

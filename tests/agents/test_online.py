@@ -161,11 +161,34 @@ def test_goes_on_from_a_saved_belief_as_if_nothing_had_been(
     straight = run(OnlineLocalizer("ekf", folder), events)[-1]
     assert found.stamp == straight.stamp
     np.testing.assert_array_equal(found.position, straight.position)
-    with pytest.raises(ValueError, match="is of agent 'ekf'"):
+    with pytest.raises(ValueError, match="agent is not 'ekf:iterations=3'"):
         OnlineLocalizer("ekf:iterations=3", folder).load(tmp_path / "belief.safetensors")
-    (tmp_path / "bad.safetensors").write_bytes(b"\x00" * 40)
-    with pytest.raises(ValueError, match=r"bad\.safetensors"):
-        second.load(tmp_path / "bad.safetensors")
+
+
+def test_a_damaged_belief_is_refused_and_changes_nothing(
+    folder: Path, events: Events, tmp_path: Path
+) -> None:
+    whole, damaged = tmp_path / "belief.safetensors", tmp_path / "bad.safetensors"
+    first, half = OnlineLocalizer("ekf", folder), len(events) // 2
+    run(first, events[: half // 2])
+    first.save(whole)
+    data, rng = whole.read_bytes(), random.Random(0)
+    online = OnlineLocalizer("ekf", folder)
+    for event in events[:half]:
+        online.add(**event)
+    for _ in range(100):
+        cut, at = rng.random() < 0.2, rng.randrange(len(data))
+        flipped = bytes([data[at] ^ (1 << rng.randrange(8))])
+        damaged.write_bytes(data[:at] if cut else data[:at] + flipped + data[at + 1 :])
+        with pytest.raises(ValueError, match=r"bad\.safetensors"):
+            online.load(damaged)
+    found, straight = (
+        run(online, events[half:])[-1],
+        run(OnlineLocalizer("ekf", folder), events)[-1],
+    )
+    np.testing.assert_array_equal(found.position, straight.position)
+    with pytest.raises(OSError, match="nothing"):
+        online.load(tmp_path / "nothing")
 
 
 @pytest.mark.parametrize(

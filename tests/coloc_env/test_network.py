@@ -173,7 +173,7 @@ def test_loss_falls_on_each_direction_and_step_by_itself() -> None:
 
 @pytest.mark.parametrize("network", [Network(failure=0.3), Network(4.0, (), 0.0, 0, 5, 0.3)])
 def test_broken_links_carry_nothing_either_way(network: Network) -> None:
-    """A share of all links in each step, drawn anew."""
+    """A share of all links in each step, drawn again."""
     n = 6 if network.dense(6) else 24
     whole = World(
         replace(make_scenario("indoor-v0", n_uavs=n), network=replace(network, failure=0.0)), 20

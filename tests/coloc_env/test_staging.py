@@ -196,6 +196,7 @@ OLD |= {"results.json": "old"}
 NEW = {"note.txt": "mine", "tum": "", "tum/uav_0.txt": "new", "results.json": "new"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
 def test_killed_at_every_call_while_results_are_replaced(tmp_path: Path, after: bool) -> None:
     """Whoever sees results.json sees the old or the new whole; after ``recover`` everybody does,

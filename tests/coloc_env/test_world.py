@@ -111,7 +111,7 @@ def same(batch: Record, row: int, single: Record, but: Sequence[str] = ()) -> No
             assert torch.equal(batch[name][row], value[0]), name
 
 
-@pytest.mark.parametrize("window", [None, 1, 7, 64])
+@pytest.mark.parametrize("window", [None, 7])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_each_row_is_the_world_of_its_seed(variant: str, window: int | None) -> None:
     scenario = make_scenario("indoor-v0", **VARIANTS[variant])
@@ -200,7 +200,7 @@ def compare_episodes(
 MOMENTS = ["plain", "motion random_velocity", "message delay", "delay", "failures", "many"]
 
 
-@pytest.mark.parametrize("window", [None, 1, 7])
+@pytest.mark.parametrize("window", [None, 7])  # others: at any moment, below
 @pytest.mark.parametrize("variant", [*MOMENTS, "biases", "anchors"])
 def test_rows_reset_alone(variant: str, window: int | None) -> None:
     resets = {

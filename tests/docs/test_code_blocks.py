@@ -19,7 +19,7 @@ import typer.main
 from agents import LOCALIZERS
 from coloc_env import SCENARIOS, options
 from coloc_env.registry import Registry
-from coloc_env.scenarios import parse_override
+from coloc_env.scenarios import parse_overrides
 from training.cli.command import app
 from training.learning.registry import TRAININGS
 from training.reproduce.study import STUDIES
@@ -70,6 +70,7 @@ def test_there_is_something_to_test() -> None:
     assert len(lines()) >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", scripts(), ids=shown)
 def test_python_runs(page: Path, tmp_path: Path) -> None:
     script = tmp_path / "page.py"
@@ -104,8 +105,7 @@ def test_command_lines_are_valid(page: str, line: str) -> None:
     if name == "train" and given["name"]:
         check(TRAININGS, given["name"], *given["settings"] or ())
     elif scenario and scenario not in EXAMPLE:
-        for setting in given.get("settings") or ():
-            parse_override(scenario, setting)
+        parse_overrides(scenario, given.get("settings") or ())
     if name == "reproduce":
         check(STUDIES, given["study"])
 

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from agents.tasks import TASKS, make_task
+from agents.tasks.leaderboard import FOLDER
 from training.evaluation.score import FIRST_SEED
 
 DOCS = Path(__file__).parents[2] / "docs"
-SCORES = sorted((DOCS / "results" / "scores").glob("*/*.json"))
+SCORES = sorted(FOLDER.glob("*/*.json"))
 
 
 def hook(name: str) -> Any:

@@ -51,6 +51,7 @@ def test_workers_that_cannot_be_are_refused(jobs: int, ray: str | None, why: str
 
 
 _PARENT = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
@@ -58,6 +59,7 @@ from units import Unit
 from training import pool
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     units = [Unit(Path(sys.argv[1]), str(i), seconds=300.0) for i in range(4)]
     list(pool.work(units, pool.Workers(2), lambda unit, size: None))
 """
@@ -81,12 +83,12 @@ def test_workers_end_with_their_parent(kill: signal.Signals, tmp_path: Path) -> 
     command = [sys.executable, str(script), str(out), str(Path(__file__).parent)]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 60)
+        _wait_for(lambda: len(list(out.glob("*.try-*"))) == 2, 300)
         workers = [int(file.name.rsplit("-", 1)[1]) for file in out.glob("*.try-*")]
         assert all(map(_running, workers))
         parent.send_signal(kill)
-        parent.wait(20)
-        _wait_for(lambda: not any(map(_running, workers)), 10)
+        parent.wait(120)
+        _wait_for(lambda: not any(map(_running, workers)), 120)
     finally:
         parent.kill()
         parent.wait()

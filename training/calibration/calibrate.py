@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coloc_env.datasets.noise_model import MotionModel, NoiseModel, ScalarModel
+from coloc_env.datasets.noise_model import MotionModel, NoiseModel
 from coloc_env.datasets.recording import Floats, Recording, Table, Track
 from training.calibration.inertial import calibrate_imu
 from training.calibration.noise import Noise
@@ -61,7 +61,7 @@ def calibrate(recording: Recording, *, motion: str = "auto") -> Calibration:
     if "height" in recording.streams:
         height = calibrate_heights(recording)
         if height is not None:
-            model = replace(model, height=ScalarModel(height.white, height.bias))
+            model = replace(model, height=replace(model.height, std=height.white, bias=height.bias))
             noises["height"] = height
     wheels = calibrate_odometry(recording)
     if wheels is not None:

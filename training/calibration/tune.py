@@ -35,8 +35,11 @@ _SENSORS = {
     "landmark_bearings": ("range_std", "bearing_std"),
     "uav_bearings": ("range_std", "bearing_std"),
     "landmark_vectors": ("std",),
+    "tdoa": ("std",),
+    "arrival_angles": ("azimuth_std", "elevation_std"),
+    "flow": ("std",),
     "height": ("std",),
-    "position_fix": ("std",),
+    "position_fix": ("std", "vertical_std"),
 }
 Progress = Callable[[str, int, int], None]
 

@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from training.cli.bench import bench
+from training.cli.dataset import dataset
 from training.cli.evaluate import evaluate
 from training.cli.lists import agents, scenarios
 from training.cli.live import live
@@ -75,6 +76,7 @@ for _command in (
     render,
     view,
     live,
+    dataset,
     bench,
     train,
     reproduce,

@@ -54,9 +54,9 @@ def build_scenario(
         os.environ["COLOC_DATA"] = str(data)
     from dataclasses import replace
 
-    from coloc_env.scenarios import make_scenario, parse_override
+    from coloc_env.scenarios import make_scenario, parse_overrides
 
-    overrides = dict(parse_override(name, text) for text in settings or ())
+    overrides = parse_overrides(name, settings or ())
     return replace(make_scenario(name, **overrides), overrides=overrides)
 
 

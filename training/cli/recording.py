@@ -1,5 +1,6 @@
 """``coloc recording``: recordings of one's own."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,6 +31,16 @@ recording = typer.Typer(
     --out results/flight
     """,
 )
+
+
+class ExportFormat(StrEnum):
+    """What a recording can be written as."""
+
+    open = "open"
+    tum = "tum"
+    bag = "bag"
+
+
 Folder = Annotated[
     Path, typer.Argument(metavar="DIR", help="A folder in the open recording format.")
 ]
@@ -88,29 +99,47 @@ def check(
 @recording.command()
 def export(
     scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="**replay-miluv-v0** or another recording.")
+        str,
+        typer.Argument(
+            metavar="SCENARIO", help="**replay-miluv-v0**, another recording, or a folder of yours."
+        ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
     sequence: Annotated[
         str | None, typer.Option(help="Which sequence; see **coloc recordings**.")
     ] = None,
+    kind: Annotated[
+        ExportFormat,
+        typer.Option(
+            "--format",
+            help="**open**, everything; **tum** or **bag** (ROS 2), the true trajectories alone.",
+        ),
+    ] = ExportFormat.open,
     data: Data = None,
 ) -> None:
-    """Write a recording that coloc knows in the open format, exact to the bit.
+    """Write a recording that coloc knows in the open format, exact to the bit, or its trajectories
+    for other tools, with attitudes and the stamps that were recorded.
 
     **Examples**
 
     coloc recording export replay-miluv-v0 --out miluv
 
     coloc recording export replay-mrclam-v0 --sequence MRCLAM_Dataset7 --out seven
+
+    coloc recording export flight --format tum --out flight_tum
     """
     from coloc_env import options
     from coloc_env.datasets import DATASETS, load
-    from coloc_env.datasets.open_format import write_recording
+    from coloc_env.datasets.open_format import read_recording, write_recording
+    from coloc_env.datasets.trajectories import write_bag, write_tum
 
     known = {f"replay-{name}-v0": name for name in DATASETS}
-    options.require_known("recording", [scenario], known)
-    write_recording(load(known[scenario], sequence, data), out)
+    if scenario not in known and Path(scenario).is_dir():
+        found = read_recording(scenario)
+    else:
+        options.require_known("recording", [scenario], known)
+        found = load(known[scenario], sequence, data)
+    {"open": write_recording, "tum": write_tum, "bag": write_bag}[kind.value](found, out)
     typer.echo(f"written to {out}")
 
 
@@ -184,10 +213,12 @@ def calibrate(
     """
     from coloc_env.datasets.noise_model import write_noise_model
     from coloc_env.datasets.open_format import read_recording
-    from coloc_env.staging import staged_file
+    from coloc_env.staging import require_writable, staged_file
     from training.calibration.calibrate import calibrate as learn
     from training.calibration.calibrate import part_of
 
+    path = folder / "believed.yaml" if out is None else out
+    require_writable(path)
     found = read_recording(folder)
     if span is not None:
         found = part_of(found, _span(span))
@@ -199,12 +230,12 @@ def calibrate(
     show(["", "samples", "bias", "σ", "beyond 3 σ", "σ if white"], lines)
     model, notes = learnt.model, learnt.notes
     if tune is not None:
-        from coloc_env.scenarios import parse_override
+        from coloc_env.scenarios import parse_overrides
         from training.calibration.tune import tuned
 
         if not found.tracked:
             raise ValueError("--tune needs ground truth")
-        chosen = dict(parse_override("replay-v0", text) for text in settings or ())
+        chosen = parse_overrides("replay-v0", settings or ())
         if span is not None:
             chosen.setdefault("span", _span(span))
         with progress() as bars:
@@ -212,7 +243,6 @@ def calibrate(
         notes = (*notes, *words)
     for note in notes:
         typer.echo(note)
-    path = folder / "believed.yaml" if out is None else out
     part = "all of it" if span is None else f"{span} s of it"
     with staged_file(path) as file:
         text = write_noise_model(model, f"{found.name}: calibrated on {part}")

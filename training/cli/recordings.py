@@ -59,10 +59,14 @@ def recordings(
     from training.threads import use_threads
 
     use_threads(threads)
-    from coloc_env.staging import staged_file
+    from coloc_env.datasets import DATASETS
+    from coloc_env.options import require_known
+    from coloc_env.staging import require_writable, staged_file
     from training.evaluation import recordings as all_of_them
     from training.evaluation.evaluate import split_agents
 
+    require_known("dataset", None if only is None else only.split(","), DATASETS)
+    require_writable(out)
     names = all_of_them.AGENTS if agents == "default" else tuple(split_agents(agents))
     figures: dict[str, dict[str, dict[str, object]]] = {}
     tuned: dict[str, bool] = {}

@@ -26,10 +26,11 @@ def report(
     """
     if out.suffix.lower() != ".html":
         raise ValueError(f"--out {out} is not allowed: a name ending in .html")
-    from coloc_env.staging import recover, staged_file
+    from coloc_env.staging import recover, require_writable, staged_file
     from training.evaluation.report.page import page
     from training.evaluation.runs import read
 
+    require_writable(out)
     for folder in runs:
         recover(folder)
     text = page([read(folder) for folder in runs])

@@ -1,7 +1,7 @@
 """``coloc tasks`` and ``coloc score``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,7 +15,8 @@ def tasks(
         typer.Argument(metavar="[TASK]", help="Show this task's options; none: list all."),
     ] = None,
 ) -> None:
-    """List the tasks in which decisions matter, or one task's options and heuristics.
+    """List the tasks in which decisions matter, with stored scores, or one task's options and
+    heuristics.
 
     **Examples**
 
@@ -24,10 +25,13 @@ def tasks(
     coloc tasks survey-v0
     """
     from agents.tasks import TASKS
+    from agents.tasks.leaderboard import scores
     from coloc_env.options import paragraphs
 
     if name is None:
-        show(["task", ""], [[key, TASKS.summary(key)] for key in TASKS])
+        found = scores()
+        lines = [[key, _best(found.get(key, [])), TASKS.summary(key)] for key in TASKS]
+        show(["task", "returns: random, best known", ""], lines)
         typer.echo("coloc tasks TASK lists its options and its heuristics.")
         return
     explain(name, TASKS, "option")
@@ -37,6 +41,13 @@ def tasks(
         if rows:
             typer.echo("")
             show([{"policies": "heuristic", "planners": "planner"}[what], ""], rows)
+
+
+def _best(stored: list[dict[str, Any]]) -> str:
+    """Returns of random actions and of the best of some stored scores, the best first."""
+    if not stored:
+        return ""
+    return f"{stored[0]['random']:.1f}, {stored[0]['return']:.1f} ({stored[0]['label']})"
 
 
 def score(
@@ -76,14 +87,14 @@ def score(
         raise ValueError(f"--worlds {worlds} is not allowed: at least 4")
     import json
 
-    from coloc_env.staging import staged_file
+    from coloc_env.staging import require_writable, staged_file
     from training.evaluation.score import score as measure
 
+    require_writable(out)
     with progress() as advance:
         found = measure(task, policy, worlds, advance)
     found |= {"label": label or policy, "link": link}
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         with staged_file(out) as file:
             file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     low, high = found["interval_95"]

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from coloc_env.options import paragraphs
+from coloc_env.options import paragraphs, typed
 from coloc_env.registry import Registry
 
 _PIPED = 160  # columns of a table that no terminal shows
@@ -20,8 +20,6 @@ _PIPED = 160  # columns of a table that no terminal shows
 def explain(name: str, registry: Registry, kind: str) -> None:
     """Print what a registered name is by its docstring, and its options (each a ``kind``, a
     singular noun) in groups: what each may be, with its unit, and its default."""
-    from training.evaluation.tables import typed
-
     known = registry.options_of(name)
     text = "\n\n".join(map(escape, paragraphs(inspect.getdoc(registry[name]) or "")))
     console = Console()

@@ -72,7 +72,7 @@ def train(
     tensorboard --logdir runs
     """
     use_threads(threads)
-    from coloc_env.options import parse
+    from coloc_env.options import parse_all
     from training.learning import run
     from training.learning.registry import TRAININGS
 
@@ -98,7 +98,7 @@ def train(
         return
     else:
         known = TRAININGS.options_of(name)
-        chosen |= dict(parse(name, text, known) for text in settings or ())
+        chosen |= parse_all(name, settings or (), known)
         with workers_of(jobs, ray) as workers, progress() as bars:
             weights = run.start(name, chosen, out, bars, workers)
     typer.echo(f"weights written to {weights}")

@@ -19,7 +19,8 @@ from training.evaluation.tables import short
 
 AGENTS = (
     *("ekf", "ekf:robust=huber", "ekf_trust:bank=false", "ekf_trust"),
-    *("map", "hpff:main=ekf", "nnhpff:main=ekf"),
+    *("ekf:robust=huber:fusion=pairwise", "ekf_joint:robust=huber"),
+    *("map", "stdcl:bank=true", "hpff:main=ekf", "nnhpff:main=ekf"),
 )
 CLASSICAL = AGENTS[:2]
 _DASH = "–"
@@ -75,6 +76,9 @@ def measure(
     seeds = torch.arange(seed, seed + runs)
     for i, agent in enumerate(agents):
         progress(scenario.name, i, len(agents))
+        if scenario.arena.n_uavs == 1 and ("fusion=" in agent or "joint" in agent):
+            found[agent] = {"refused": "a team of one has nothing to fuse"}
+            continue
         try:
             localizer = make(agent, scenario)
         except ValueError as error:

@@ -48,7 +48,7 @@ class Step:
 
 @torch.no_grad()
 def rollout(
-    localizer: Localizer,
+    localizer: Localizer | None,
     scenario: Scenario,
     seeds: Int64[Tensor, "B"],
     steps: int | None = None,
@@ -57,6 +57,7 @@ def rollout(
     timed: bool = False,
 ) -> Iterator[Step]:
     """A localizer's steps in the worlds of ``seeds``: ``steps`` of them (default: the horizon).
+    Without one nobody estimates, and the action is what the prior says.
 
     The world moves on when the next step is asked for. From step ``stop`` on the localizer is not
     asked any more, and its last action stands. Worlds are on ``device``, where the localizer must
@@ -71,7 +72,7 @@ def rollout(
     horizon = scenario.horizon if steps is None else steps
     for k in range(horizon):
         seconds = 0.0
-        if stop is None or k < stop:
+        if localizer is not None and (stop is None or k < stop):
             try:
                 belief = localizer.reset(observation) if k == 0 else belief
                 start = clock(world.device) if timed else time.perf_counter()

@@ -4,8 +4,8 @@ import csv
 import html
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any
 
+from coloc_env.options import typed
 from training.evaluation import metrics
 from training.evaluation.results import Evaluation, plain
 
@@ -120,13 +120,6 @@ def left_out(results: Evaluation) -> str:
     """What of a recording was left out."""
     streams = ", ".join(f"{count} of {stream}" for stream, count in results.dropped.items())
     return f"Left out of the recording, since no sensor can have measured it: {streams}."
-
-
-def typed(value: Any) -> str:
-    """A setting as it would be typed on a command line."""
-    if isinstance(value, list | tuple):
-        return ",".join(map(typed, value))
-    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
 def csv_text(results: Evaluation) -> str:

@@ -1,7 +1,9 @@
 """Policies of a task by name, and those written for one PettingZoo world."""
 
 import importlib
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,9 +36,28 @@ def _find(task: Task, name: str) -> Policy:
         return task.policy(name)
     try:
         policy: Policy = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, SyntaxError, TypeError, ValueError) as error:
         raise ValueError(f"--policy {name}: {error}") from error
-    return policy
+    return _guarded(name, policy)
+
+
+def _guarded(name: str, policy: Policy) -> Policy:
+    """Somebody's own policy, whose errors are one line that says where; the traceback is their
+    cause."""
+
+    def guarded(seen: Seen) -> Tensor:
+        try:
+            action = policy(seen)
+        except Exception as error:  # somebody's own code may raise anything
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(last.filename).name}, line {last.lineno}"
+            what = f"{type(error).__name__}: {error}"
+            raise ValueError(f"--policy {name}: {what} ({where})") from error
+        if not isinstance(action, Tensor):
+            raise ValueError(f"--policy {name}: returns {type(action).__name__}, not a tensor")
+        return action
+
+    return guarded
 
 
 def from_pettingzoo(make: Callable[[], WorldPolicy]) -> Policy:

@@ -118,7 +118,7 @@ def _ppo(
     seed: Seed = 0,
     score_runs: ScoreRuns = 40,
 ) -> Training:
-    scenarios = [parse_scenario(f"{scenario}:{v}".strip(":")) for v in variants.split("/")]
+    scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches(name, scenarios, steps)
     if worlds % len(scenarios):
         raise ValueError(

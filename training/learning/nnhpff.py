@@ -124,7 +124,7 @@ def nnhpff(
     and high process noise, range noise and number of particles. ``score_runs``: held-out worlds in
     which pf, hpff and nnhpff are compared at the end.
     """
-    scenarios = [parse_scenario(f"{scenario}:{one}".strip(":")) for one in variants.split("/")]
+    scenarios = [parse_scenario(scenario, one) for one in variants.split("/")]
     kinds = {(one.horizon, one.arena.n_uavs, _anchors(one)) for one in scenarios}
     if len(kinds) > 1:
         raise ValueError(
@@ -190,7 +190,7 @@ def score(detector: FailureDetector, base: str, runs: int, progress: Progress) -
     if runs == 0 or base.split(":")[0] != "wsn-v0":
         return found
     for case in (1, 2, 3):
-        scenario = parse_scenario(f"{base}:case={case}")
+        scenario = parse_scenario(base, f"case={case}")
         each: dict[str, float] = {}
         for name in ("pf", "hpff", "nnhpff"):
             options: dict[str, Any] = {} if name == "pf" else {"bank": False}

@@ -22,12 +22,11 @@ from torchrl.objectives import LossModule
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from agents.weights import SUFFIX, Learned, card_of, shipped, write
-from coloc_env import options
+from coloc_env import options, state_file
 from coloc_env.json_files import read_json
-from coloc_env.options import Quantity
+from coloc_env.options import Quantity, typed
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
-from training.evaluation.tables import typed
-from training.learning import curves, state
+from training.learning import curves
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
 from training.learning.registry import TRAININGS
@@ -195,7 +194,7 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
 
     def save(epochs: int) -> None:
         logger.sync()
-        state.save(file, {"run": _identity(config), "trainer": trainer.state_dict()})
+        state_file.save(file, {"run": _identity(config), "trainer": trainer.state_dict()})
         progress(name, epochs, collector.epochs)
 
     collector.on_epoch_end = save
@@ -277,7 +276,7 @@ def _identity(config: Mapping[str, Any]) -> str:
 
 def _restore(file: Path, config: Mapping[str, Any], trainer: TrainerLike) -> None:
     """Put a state into a trainer; ValueError if it is another run's."""
-    found = state.load(file)
+    found = state_file.load(file)
     if found.get("run") != _identity(config):
         raise ValueError(
             f"{file} is the state of {found.get('run')}, {_CONFIG} describes {_identity(config)}"

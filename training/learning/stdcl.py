@@ -156,7 +156,7 @@ def stdcl(
     agent: str = "stdcl",
     start: str = "none",
     kernel: Annotated[int, Quantity("steps", 1, 100)] = 3,
-    convolutions: bool = True,
+    levels: Annotated[int, Quantity("", 0, 6)] = 3,
     worlds: Worlds = 4,
     epochs: Epochs = 10,
     steps: Steps = 10,
@@ -173,23 +173,19 @@ def stdcl(
     ``scenario``, separated by slashes) are run by ``agent`` (``stdcl`` with any options but
     weights, or ``stgat``) with its newest weights; every ``steps`` steps the loss is backpropagated
     through them. ``start``: weights to start from, a checkpoint's name or path; else the network
-    is a new one with this ``kernel`` in time, or without ``convolutions``.
+    is a new one with this ``kernel`` in time and convolutions in so many ``levels`` (0: none).
     From the share ``smooth_from`` of the epochs on it contains the trajectory's second difference.
     The learning rate falls from ``learning_rate`` to ``last_rate`` along a cosine. ``augment``: the
     paper's augmentations. ``score_runs``: held-out worlds in which stdcl and its optimizer alone
     are compared at the end.
     """
-    scenarios = [
-        parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
-    ]
+    scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl", scenarios, steps)
     name = agent.split(":")[0]
     if name not in METHODS:
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
     agent = f"{agent}:weights=none"
-    network = learned(
-        StGnn, start, seed, kernel=kernel, temporal=convolutions, kinematic=name == "stdcl"
-    )
+    network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=name == "stdcl")
     loops: list[Any] = [make(agent, one) for one in scenarios]
     for loop in loops:
         loop.learn(network)
@@ -235,7 +231,7 @@ def score(
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        scenario = parse_scenario(f"swarm-v0:{variant}".rstrip(":"))
+        scenario = parse_scenario("swarm-v0", variant)
         loop: Any = make(agent, scenario)
         loop.learn(network)
         each = {}

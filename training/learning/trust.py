@@ -159,7 +159,7 @@ def trust(
     whose weights it starts from (``none``: random ones).
     ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
     """
-    scenarios = [parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in VARIANTS]
+    scenarios = [parse_scenario(scenario, variant) for variant in VARIANTS]
     require_batches("trust", scenarios, steps)
     network = _first(start, seed)
     filters: list[Any] = [make("ekf_trust:bank=false:weights=none", one) for one in scenarios]
@@ -216,7 +216,7 @@ def score(network: TrustNetwork, base: str, runs: int, progress: Progress) -> Ma
     if runs == 0:
         return found
     for variant in SCORED:
-        scenario = parse_scenario(f"{base}:horizon=300:{variant}".rstrip(":"))
+        scenario = parse_scenario(base, f"horizon=300:{variant}".rstrip(":"))
         ours: Any = make("ekf_trust:weights=none", scenario)
         ours.learn(network)
         each = {}

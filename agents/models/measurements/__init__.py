@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from agents.models.measurements.angles import UavAngles
 from agents.models.measurements.base import (
     Block,
     Measurement,
@@ -12,6 +13,8 @@ from agents.models.measurements.base import (
     received,
 )
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
+from agents.models.measurements.differences import RangeDifferences
+from agents.models.measurements.flow import BodyVelocities
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
 from coloc_env.scenario import (
@@ -23,13 +26,16 @@ from coloc_env.scenario import (
 )
 from coloc_env.sensors import (
     AnchorRanging,
+    ArrivalAngles,
     Height,
     LandmarkBearings,
     Landmarks,
+    OpticalFlow,
     PositionFix,
     Ranging,
     Sensor,
     SlowFlight,
+    Tdoa,
     UavBearings,
 )
 from coloc_env.sensors.base import usable
@@ -38,13 +44,16 @@ __all__ = [
     "MODELS",
     "AnchorRanges",
     "Block",
+    "BodyVelocities",
     "Heights",
     "LandmarkRangeBearings",
     "LandmarkVectors",
     "Measurement",
     "Neighbours",
     "PositionFixes",
+    "RangeDifferences",
     "Slowness",
+    "UavAngles",
     "UavRangeBearings",
     "UavRanges",
     "make_measurements",
@@ -60,15 +69,18 @@ _M = TypeVar("_M", bound=Callable[[Any], Measurement])
 
 MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     AnchorRanging: AnchorRanges,
+    ArrivalAngles: UavAngles,
     Height: Heights,
     LandmarkBearings: LandmarkRangeBearings,
     Landmarks: LandmarkVectors,
+    OpticalFlow: BodyVelocities,
     PositionFix: PositionFixes,
     Ranging: UavRanges,
     SlowFlight: Slowness,
+    Tdoa: RangeDifferences,
     UavBearings: UavRangeBearings,
 }
-_BODY_FRAME = (Landmarks, LandmarkBearings, UavBearings)
+_BODY_FRAME = (ArrivalAngles, Landmarks, LandmarkBearings, OpticalFlow, UavBearings)
 
 
 def measures(sensor: type[Sensor]) -> Callable[[_M], _M]:

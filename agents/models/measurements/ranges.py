@@ -11,8 +11,8 @@ from agents.models.measurements.base import (
     believed_biases,
     noise_std,
 )
+from agents.models.measurements.tags import OwnTags
 from agents.models.process import Process
-from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import AnchorRanging, RangeNoise, Ranging
 from coloc_env.sensors.base import usable
@@ -27,7 +27,7 @@ class _Ranges(Measurement):
 
     def __init__(self, noise: RangeNoise, tags: Tags) -> None:
         self.noise, self.variance = noise, noise_std(noise.std) ** 2
-        self.tags = tags
+        self.tags = OwnTags(tags)
         self.bias_std, self.bias_time = believed_biases(noise.bias_std), noise.bias_time
 
     def read(
@@ -37,32 +37,6 @@ class _Ranges(Measurement):
         z = observation[self.leaf].unsqueeze(-1)
         z, mask = usable(z, observation[self.mask_leaf] > 0, ranges=True)
         return z[..., 0], mask
-
-    def _arms(self, x: Float[Tensor, "B N S"]) -> Float[Tensor, "B N T d"]:
-        """Lever arms [N, T, d], with a dimension 1 for particles where x has them."""
-        arms = x.new_tensor(self.tags)
-        return arms.unsqueeze(1) if x.dim() == 4 else arms
-
-    def _own_tags(
-        self, process: Process, x: Float[Tensor, "B N S"]
-    ) -> tuple[Float[Tensor, "B N T d"], Float[Tensor, "B N T d t"] | None, float]:
-        """Tag positions, their derivative by the attitude error, and the variance that unknown
-        lever arms leave."""
-        d = process.dim
-        position = x[..., None, :d]
-        if not self.tags:
-            return position, None, 0.0
-        arms = self._arms(x)
-        rotation = process.rotation(x)
-        if rotation is None:
-            spread = float((arms**2).sum(-1).mean()) / d
-            return position.expand(*x.shape[:-1], arms.shape[-2], d), None, spread
-        turned = (rotation.unsqueeze(-3) @ arms.unsqueeze(-1))[..., 0]
-        if d == 3:
-            derivative = -rotation.unsqueeze(-3) @ cross_matrix(arms)
-        else:
-            derivative = torch.stack((-turned[..., 1:], turned[..., :1]), -2)
-        return position + turned, derivative, 0.0
 
     def _variance(self, distance: Float[Tensor, "B N T P"]) -> Float[Tensor, "B N T*P 1"]:
         """R of each range, at the distance that is expected."""
@@ -81,7 +55,7 @@ class _Ranges(Measurement):
         derivatives: bool,
     ) -> tuple[Block, Float[Tensor, "B N T P d"]]:
         """The block of all (own tag, point) pairs, and the unit vectors from point to tag."""
-        tags, derivative, spread = self._own_tags(process, x)
+        tags, derivative, spread = self.tags.at(process, x)
         apart = tags.unsqueeze(-2) - points
         distance = torch.linalg.vector_norm(apart, dim=-1).clamp_min(1e-9)
         unit = apart / distance.unsqueeze(-1)

@@ -2,6 +2,7 @@
 slowness."""
 
 from abc import abstractmethod
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -74,7 +75,11 @@ class _Coordinates(Measurement):
     """Some components of position or velocity themselves, as one measurement."""
 
     def __init__(self, sensor: PositionFix | Height | SlowFlight) -> None:
-        self.variance = noise_std(sensor.std) ** 2
+        self.sensor = sensor
+
+    def variance(self, dim: int) -> float | list[float]:
+        """R of each component."""
+        return noise_std(self.sensor.std) ** 2
 
     @abstractmethod
     def components(self, dim: int) -> slice:
@@ -105,7 +110,7 @@ class _Coordinates(Measurement):
         return Block(
             residual=residual,
             jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
+            variance=x.new_tensor(self.variance(process.dim)).expand_as(residual),
             mask=mask,
         )
 
@@ -115,6 +120,13 @@ class PositionFixes(_Coordinates):
 
     mask_leaf = "position_fix_mask"
 
+    def __init__(self, sensor: PositionFix) -> None:
+        super().__init__(sensor)
+        self.axis_std = sensor.axis_std
+
+    def variance(self, dim: int) -> list[float]:
+        return [noise_std(std) ** 2 for std in self.axis_std(dim)]
+
     def components(self, dim: int) -> slice:
         return slice(0, dim)
 
@@ -123,13 +135,28 @@ class PositionFixes(_Coordinates):
 
 
 class Heights(_Coordinates):
-    """z of the position."""
+    """z of the position, and the bias where the motion model has it as a state."""
 
     mask_leaf = "height_mask"
 
     def __init__(self, sensor: Height) -> None:
         super().__init__(sensor)
-        self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
+        if not sensor.estimated:
+            self.bias_std, self.bias_time = believed_biases(sensor.bias_std), sensor.bias_time
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        block = super().linearize(process, x, observation, neighbours, derivatives)
+        if not process.drift_size:
+            return block
+        block.jacobian[..., -1] = 1.0
+        return replace(block, residual=block.residual - x[..., -1:].unsqueeze(-2))
 
     def components(self, dim: int) -> slice:
         return slice(2, 3)

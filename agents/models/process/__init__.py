@@ -1,4 +1,4 @@
-"""What a team believes of its motion: one interface, five models, batched over anything.
+"""What a team believes of its motion: one interface, six models, batched over anything.
 
 A state is a flat tensor ``[position, velocity, attitude?, biases?]``; its error lives in the
 tangent space (attitude perturbed on the right, in the body frame), of size ``error_size``. Position
@@ -9,15 +9,17 @@ import math
 
 from agents.models.process.base import Process
 from agents.models.process.constant_velocity import ConstantVelocityProcess
+from agents.models.process.drifting import DriftingProcess
 from agents.models.process.inertial import InertialProcess
 from agents.models.process.reckoned import DisplacementProcess, InsProcess, WheeledProcess
 from coloc_env import scenario as believed_processes
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Displacement, Imu, Ins, Odometry, Sensor
+from coloc_env.sensors import Displacement, Height, Imu, Ins, Odometry, Sensor
 
 __all__ = [
     "ConstantVelocityProcess",
     "DisplacementProcess",
+    "DriftingProcess",
     "InertialProcess",
     "InsProcess",
     "Process",
@@ -43,7 +45,9 @@ def drives(believed: Believed, sensor: Sensor) -> bool:
 
 def make_process(believed: Believed) -> Process:
     """The motion model that a team believes in; ValueError if a sensor it needs is missing."""
-    process = _process(believed)
+    process, height = _process(believed), believed.sensor(Height)
+    if height is not None and height.estimated and height.bias_std:
+        process = DriftingProcess(process, height)
     process.vague = max(process.vague, _VAGUE * math.dist(believed.arena.low, believed.arena.high))
     return process
 

@@ -16,6 +16,7 @@ LEAST_STD = 1e-6  # m, m/s, rad, and of biases: of a prior, whose covariance mus
 
 class Process(ABC):
     """A motion model. ``attitude_error`` is the attitude's slice of the error, if it is a state;
+    ``drift_size``: how many states, the last ones, are biases of what measures heights;
     ``vague`` (m per axis) the position's standard deviation beyond which measurements are not
     linearized all at once."""
 
@@ -23,6 +24,7 @@ class Process(ABC):
     error_size: int
     noise_size: int
     attitude_size: int = 0
+    drift_size: int = 0
     attitude_error: slice | None = None
     vague: float = 0.5
 

@@ -91,6 +91,10 @@ def _height(message: Any) -> dict[str, float]:
     return {"height": message.range}
 
 
+def _velocity(twist: Any) -> dict[str, float]:
+    return {"vx": twist.linear.x, "vy": twist.linear.y}
+
+
 def _field(message: Any) -> dict[str, float]:
     b = message.magnetic_field
     return {"x": b.x, "y": b.y, "z": b.z}
@@ -115,6 +119,10 @@ KNOWN: dict[str, dict[str, Callable[[Any], Cells]]] = {
     "odometry": {"nav_msgs/msg/Odometry": _twist},
     "ranges": {"sensor_msgs/msg/Range": _range},
     "height": {"sensor_msgs/msg/Range": _height},
+    "flow": {
+        "geometry_msgs/msg/TwistStamped": lambda m: _velocity(m.twist),
+        "geometry_msgs/msg/TwistWithCovarianceStamped": lambda m: _velocity(m.twist.twist),
+    },
     "magnetometer": {"sensor_msgs/msg/MagneticField": _field},
 }
 PLACES = ("truth", "position_fix")

@@ -50,6 +50,10 @@ class Columns:
             f"{self.path}, {self.word} {self.lines[row]}, column {column}: {value} {reason}"
         )
 
+    def refuse(self, reason: str) -> NoReturn:
+        """Raise a DataError about the whole table."""
+        raise DataError(f"{self.path}, {self.word} 1: {reason}")
+
     def require(self, *columns: str) -> Floats:
         """Columns [T, F] of numbers; DataError if one is not there."""
         for column in columns:

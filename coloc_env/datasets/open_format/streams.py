@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_env.datasets.open_format import frames
+from coloc_env.datasets.open_format import carried, frames
+from coloc_env.datasets.open_format.carried import REACH, Made, tags_of
 from coloc_env.datasets.open_format.columns import Columns, Kind
 from coloc_env.datasets.open_format.description import Description
 from coloc_env.datasets.open_format.truth import AXES, QUATERNION, indices
@@ -23,10 +24,8 @@ from coloc_env.datasets.recording import (
     plausible,
 )
 
-REACH = 1000.0  # m, of anything that measures a distance
 Read = Callable[[Path, Mapping[str, Kind]], Columns]
 Find = Callable[[Path, str], Path | None]
-Made = dict[str, tuple[Table, int]]
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def _ranges(found: Columns, about: Description) -> Made:
     if (own := to == about.robots.index(found.path.parent.name)).any():
         found.fail(own, "to", "is the robot itself")
     distance = found.require("range")[:, 0] * about.length
-    tags = _tags(found, about)
+    tags = [tags_of(found, about, column) for column in ("own_tag", "to_tag")]
     good = plausible(distance, REACH)
     robots, made = len(about.robots), Made()
     for name, among in (("uav_ranges", to < robots), ("anchor_ranges", to >= robots)):
@@ -124,18 +123,6 @@ def _ranges(found: Columns, about: Description) -> Made:
             table = Table(found.time[there], values[there], columns)
             made[name] = (table, int((among & ~good).sum()))
     return made
-
-
-def _tags(found: Columns, about: Description) -> list[Floats]:
-    """The own and the other's tag [T] of each range, counted from 0."""
-    numbers = []
-    for column in ("own_tag", "to_tag"):
-        tag = found.numbers.get(column, np.zeros(len(found)))
-        most = max(1, about.tags.shape[1])
-        if (bad := (tag != np.rint(tag)) | (tag < 0) | (tag >= most)).any():
-            found.fail(bad, column, f"is no tag from 0 to {most - 1}")
-        numbers.append(tag)
-    return numbers
 
 
 def _sightings(found: Columns, about: Description) -> Made:
@@ -306,6 +293,16 @@ FILES: dict[str, _File] = {
     ),
     "height": _File(_kinds("measured", "height", "z"), _height),
     "position_fix": _File(_kinds("measured", *AXES), _fixes),
+    "tdoa": _File(
+        _kinds("name", "from", "to")
+        | _kinds("measured", "difference")
+        | _kinds("number", "own_tag"),
+        carried.differences,
+    ),
+    "angles": _File(
+        _kinds("name", "robot") | _kinds("measured", "azimuth", "elevation"), carried.angles
+    ),
+    "flow": _File(_kinds("measured", "vx", "vy"), carried.flow),
     "magnetometer": _File(_kinds("number", *AXES), _magnetometer),
     "relative_pose": _File(
         _kinds("name", "robot") | _kinds("number", *AXES, *QUATERNION, "heading"), _poses
@@ -313,7 +310,8 @@ FILES: dict[str, _File] = {
 }
 ORDER = (
     "imu", "odometry", "landmark_bearings", "uav_bearings", "landmark_vectors", "uav_vectors",
-    "uav_ranges", "anchor_ranges", "height", "position_fix", "magnetometer", "relative_poses",
+    "uav_ranges", "anchor_ranges", "tdoa", "arrival_angles", "height", "position_fix", "flow",
+    "magnetometer", "relative_poses",
 )  # fmt: skip
 
 
@@ -326,6 +324,9 @@ def stream_files(recording: Recording) -> dict[str, tuple[str, ...]]:
         "sightings": ("landmark_bearings", "uav_bearings", "landmark_vectors", "uav_vectors"),
         "height": ("height",),
         "position_fix": ("position_fix",),
+        "tdoa": ("tdoa",),
+        "angles": ("arrival_angles",),
+        "flow": ("flow",),
         "magnetometer": ("magnetometer",),
         "relative_pose": ("relative_poses",),
     }

@@ -135,6 +135,8 @@ def _columns(recording: Recording, stream: str, table: Table) -> dict[str, Colum
         elif name == "robot":
             title = "to" if stream == "uav_ranges" else "robot"
             found[title] = _named(recording.robots, values)
+        elif name in ("from", "to"):
+            found[name] = _named(recording.anchor_names, values)
         elif name == "landmark":
             found["landmark"] = _named(recording.landmark_names, values)
         elif name in _SHOWN:

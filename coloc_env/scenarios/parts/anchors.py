@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from coloc_env.options import Count, Group
-from coloc_env.sensors import AnchorRanging, RangeNoise
+from coloc_env.options import Count, Group, Metres, PositiveMetres, Share
+from coloc_env.sensors import AnchorRanging, RangeNoise, Tdoa
+from coloc_env.sensors.ranging import Tags
 
 _SPOTS = (
     (0.0, 0.0),
@@ -28,23 +29,55 @@ class AnchorOptions(Group):
     anchors: Count = 0
     nlos_anchor: Count | None = None
 
-    def true(self, room: tuple[float, ...], noise: RangeNoise) -> AnchorRanging:
-        """The sensor as it is, in a room with sides in m."""
+    def true(self, room: tuple[float, ...], noise: RangeNoise, tags: Tags = ()) -> AnchorRanging:
+        """The sensor as it is, in a room with sides in m, to tags with lever arms."""
         blocked = () if self.nlos_anchor is None else (self.nlos_anchor,)
-        return AnchorRanging(self._places(room), noise, blocked=blocked)
+        places = anchor_places("anchors", self.anchors, room)
+        return AnchorRanging(places, noise, tags, blocked=blocked)
 
-    def believed(self, room: tuple[float, ...], noise: RangeNoise) -> AnchorRanging:
+    def believed(
+        self, room: tuple[float, ...], noise: RangeNoise, tags: Tags = ()
+    ) -> AnchorRanging:
         """The sensor that the team believes in."""
-        return AnchorRanging(self._places(room), noise)
+        return AnchorRanging(anchor_places("anchors", self.anchors, room), noise, tags)
 
-    def _places(self, room: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
-        """Positions (m); in space alternately low and high."""
-        spots = [(a * room[0], b * room[1]) for a, b in _SPOTS]
-        places: list[tuple[float, ...]] = list(spots)
-        if len(room) == 3:
-            height = room[2]
-            places = [(*spot, height * (i % 2)) for i, spot in enumerate(spots)]
-            places += [(*spot, height - height * (i % 2)) for i, spot in enumerate(spots)]
-        if not 1 <= self.anchors <= len(places):
-            raise ValueError(f"anchors={self.anchors} is not allowed: 1 to {len(places)}")
-        return tuple(places[: self.anchors])
+
+@dataclass(frozen=True)
+class TdoaOptions(Group):
+    """So many ``tdoa_anchors`` send in turn, placed as ``anchors`` are; UAVs only listen, and
+    measure how much farther each is than the one before, with noise of ``tdoa_std`` m, where both
+    lie within ``tdoa_radius`` m (none: always). A share ``tdoa_dropout`` is missing."""
+
+    title: ClassVar[str] = "time differences of arrival"
+
+    tdoa_anchors: Count = 0
+    tdoa_std: Metres = 0.15
+    tdoa_radius: PositiveMetres | None = None
+    tdoa_dropout: Share = 0.0
+
+    def true(self, room: tuple[float, ...], tags: Tags = ()) -> tuple[Tdoa, ...]:
+        """The sensor as it is, in a room with sides in m, at tags with lever arms; nothing without
+        anchors."""
+        if not self.tdoa_anchors:
+            return ()
+        if self.tdoa_anchors == 1:
+            raise ValueError("tdoa_anchors=1 is not allowed: a difference is of two")
+        places = anchor_places("tdoa_anchors", self.tdoa_anchors, room)
+        lost, near = self.tdoa_dropout, self.tdoa_radius
+        return (Tdoa(places, self.tdoa_std, tags, dropout=lost, radius=near),)
+
+
+def anchor_places(
+    option: str, count: int, room: tuple[float, ...]
+) -> tuple[tuple[float, ...], ...]:
+    """Positions (m) of so many anchors in a room with sides in m; in space alternately low and
+    high. ValueError, which names the ``option``, for more than there are places."""
+    spots = [(a * room[0], b * room[1]) for a, b in _SPOTS]
+    places: list[tuple[float, ...]] = list(spots)
+    if len(room) == 3:
+        height = room[2]
+        places = [(*spot, height * (i % 2)) for i, spot in enumerate(spots)]
+        places += [(*spot, height - height * (i % 2)) for i, spot in enumerate(spots)]
+    if not 1 <= count <= len(places):
+        raise ValueError(f"{option}={count} is not allowed: 1 to {len(places)}")
+    return tuple(places[:count])

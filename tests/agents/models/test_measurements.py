@@ -17,17 +17,20 @@ from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Sce
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     AnchorRanging,
+    ArrivalAngles,
     Height,
     Imu,
     Ins,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    OpticalFlow,
     PositionFix,
     RangeNoise,
     Ranging,
     Sensor,
     SlowFlight,
+    Tdoa,
     UavBearings,
 )
 from coloc_env.world import World
@@ -57,11 +60,21 @@ KINDS: dict[str, tuple[str, Sensor]] = {
     "landmark bearings": ("wheeled", LandmarkBearings(5, 1e-6, 1e-6, 20.0, 0.7, depth=2)),
     "uav bearings": ("wheeled", UavBearings(1e-6, 1e-6, 0.7, depth=2)),
     "height": ("velocity", Height(1e-6, dropout=0.2)),
+    "height, drift": ("velocity", Height(1e-6, bias_std=1e-6, estimated=True)),
     "slow flight": ("velocity", SlowFlight(0.5)),
     "fixes": ("inertial", PositionFix(1e-6, count=2)),
     "fixes, ins": ("ins", PositionFix(1e-6, count=2)),
     "fixes, plane": ("wheeled", PositionFix(1e-6, count=2)),
+    "fixes, up": ("inertial", PositionFix(1e-6, 2, 2e-6, outage=0.3, outage_time=1.0)),
     "ranges, ins": ("ins", Ranging(EXACT)),
+    "differences": ("inertial", Tdoa(CORNERS, 1e-6, dropout=0.2)),
+    "differences, velocity": ("velocity", Tdoa(CORNERS, 1e-6, pairs=((2, 0), (0, 1)), depth=2)),
+    "differences, tags": ("inertial", Tdoa(CORNERS, 1e-6, TAGS, depth=2)),
+    "differences, plane tags": ("wheeled", Tdoa(FLAT, 1e-6, FLAT_TAGS)),
+    "arrival angles": ("inertial", ArrivalAngles(1e-6, 1e-6, dropout=0.2, depth=2)),
+    "arrival angles, biases": ("biased", ArrivalAngles(1e-6, 1e-6)),
+    "flow": ("inertial", OpticalFlow(1e-6, dropout=0.2)),
+    "flow, biases": ("biased", OpticalFlow(1e-6)),
 }
 
 
@@ -243,10 +256,10 @@ def test_without_derivatives_the_rest_is_the_same(setting: Setting) -> None:
 
 def test_unknown_lever_arms_count_as_noise(setting: Setting) -> None:
     """What tags with no attitude, or on other UAVs, add to the variance: that of random turns."""
-    tags = getattr(setting.model, "tags", ())
+    tags = getattr(setting.model, "tags", None)
     if not tags:
         return
-    arms = torch.tensor(tags, dtype=torch.float64)
+    arms = torch.tensor(tags.arms, dtype=torch.float64)
     mean = (arms**2).sum(-1).mean() / arms.shape[-1]
     if setting.model.cooperative:
         assert setting.model.their_arms == pytest.approx(float(mean))

@@ -14,6 +14,7 @@ from torch import Tensor
 from agents.models.process import (
     ConstantVelocityProcess,
     DisplacementProcess,
+    DriftingProcess,
     InertialProcess,
     InsProcess,
     Process,
@@ -26,11 +27,12 @@ from coloc_env.network import Network
 from coloc_env.observation import Observation
 from coloc_env.scenario import ConstantVelocity, Inertial, InsDriven, Prior, Scenario, Wheeled
 from coloc_env.scenarios import make_scenario
-from coloc_env.sensors import GRAVITY, Displacement, Imu, Ins, Odometry, Sensor
+from coloc_env.sensors import GRAVITY, Displacement, Height, Imu, Ins, Odometry, Sensor
 from coloc_env.world import World
 
 DT = 0.1
 IMU, ODOMETRY = Imu(0.3, 0.05), Odometry(0.2, 0.1, 0.15, relative=0.1)
+BAROMETER = Height(bias_std=0.5, bias_time=3.0, estimated=True)
 WALKING = Inertial(0.1, 0.01, accel_walk=0.2, gyro_walk=0.03)
 PROCESSES: dict[str, Callable[[], Process]] = {
     "inertial": lambda: InertialProcess(DT, IMU, Inertial()),
@@ -44,6 +46,13 @@ PROCESSES: dict[str, Callable[[], Process]] = {
     "velocity": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7)),
     "plane": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7)),
     "damped": lambda: ConstantVelocityProcess(3, DT, ConstantVelocity(0.7, damping=0.4)),
+    "drifting": lambda: DriftingProcess(InertialProcess(DT, IMU, Inertial()), BAROMETER),
+    "drifting, biased": lambda: DriftingProcess(
+        InertialProcess(DT, IMU, Inertial(0.1, 0.01)), BAROMETER
+    ),
+    "drifting, velocity": lambda: DriftingProcess(
+        ConstantVelocityProcess(3, DT, ConstantVelocity(0.7)), BAROMETER
+    ),
     "held": lambda: ConstantVelocityProcess(2, DT, ConstantVelocity(0.7, held=True)),
 }
 INERTIAL = ("inertial", "biased", "walking")
@@ -126,10 +135,10 @@ def test_transition_is_the_derivative(process: Process) -> None:
     x, u = states(process), inputs(process)
     f, _ = process.linearize(x, u, seconds(x))
     expected = differences(process, x, u, seconds(x))
-    if process.error_size == 15:
+    if process.error_size >= 15:
         # To first order in the turn: −I dt for the right Jacobian's −J dt, which differs by half
         # the turn.
-        turn = DT * (u[..., 3:] - x[..., 13:]).norm(dim=-1)
+        turn = DT * (u[..., 3:] - x[..., 13:16]).norm(dim=-1)
         apart = torch.linalg.matrix_norm((f - expected)[..., 6:9, 12:15], ord=2)
         assert (apart <= 0.5 * turn * DT + 1e-9).all()
         f, expected = f.clone(), expected.clone()
@@ -368,3 +377,14 @@ def test_initial_error_is_what_the_prior_says() -> None:
     torch.testing.assert_close(
         covariance[0, 0].diagonal().sqrt(), torch.tensor([0.7, 0.8, 0.9]).double()
     )
+
+
+def test_a_drift_that_filters_estimate_is_a_state() -> None:
+    """And one that they only consider is none."""
+    believed = make_scenario("indoor-v0", barometer=True, landmarks=0, uwb=False).believed
+    drifting = make_process(believed)
+    assert isinstance(drifting, DriftingProcess)
+    assert (drifting.std, drifting.time) == (0.5, 300.0)
+    height = replace(believed.sensors[-1], estimated=False)
+    considered = make_process(replace(believed, sensors=(*believed.sensors[:-1], height)))
+    assert isinstance(considered, InertialProcess)

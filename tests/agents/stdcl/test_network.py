@@ -12,7 +12,7 @@ from torch import Tensor
 
 from agents.stdcl.features import SCALARS, RunningMeans, graph_inputs, initial_means
 from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, pushed_by_ranges
-from agents.stdcl.network import DILATIONS, StGnn
+from agents.stdcl.network import StGnn
 from agents.swarm import delays
 from agents.swarm.belief import Solution, StepInput
 from agents.swarm.calibration import prior_model
@@ -230,26 +230,53 @@ def test_dilated_convolutions_are_torchs() -> None:
 
 
 def test_the_receptive_field_in_time() -> None:
-    assert sum(one.length for one in StGnn(kernel=2).times) == sum(DILATIONS)  # t − 7 … t
-    assert sum(one.length for one in StGnn(kernel=3).times) == 2 * sum(DILATIONS)
+    assert sum(one.length for one in StGnn(kernel=2).times) == 1 + 2 + 4  # t − 7 … t
+    assert sum(one.length for one in StGnn(kernel=3).times) == 2 * (1 + 2 + 4)
 
 
-def test_attention_is_a_mean_over_links_and_cuts_fast_ones_of_low_confidence() -> None:
-    step = step_of(7)
+def attention_of(step: Any, **chosen: Any) -> tuple[TopologicalAttention, Any, Tensor]:
+    """A layer, a step's graph and W h for it."""
     graph, _ = graph_inputs(*step, STD, no_means(), max_offset(step[1]))
-    layer = TopologicalAttention(16, graph.vectors.shape[-1], 4).double().requires_grad_(False)
+    layer = TopologicalAttention(16, graph.vectors.shape[-1], 4, **chosen)
     mapped = torch.randn(2, N, 16, generator=torch.Generator().manual_seed(1)).double()
+    return layer.double().requires_grad_(False), graph, mapped
+
+
+def test_attention_is_a_mean_over_links() -> None:
+    layer, graph, mapped = attention_of(step_of(7))
     share = layer.attention(graph, mapped)
     linked = graph.mask.any(-1)
     assert torch.allclose(share.sum(-1)[linked], torch.ones(int(linked.sum())).double())
     assert (share[~graph.mask] == 0).all()
-    link = graph.link.clone()
-    link[0, 5, :, -1], link[0, 5, :, -2] = 0.1, 1.0
-    far = int(graph.mask[0, 5].nonzero()[0])
-    link[0, 5, far, -1], link[0, 5, far, -2] = 9.0, 0.05
-    assert layer.attention(replace(graph, link=link), mapped)[0, 5, far] == 0
-    link[0, 5, far, -2] = 0.5  # fast, but of high confidence
-    assert layer.attention(replace(graph, link=link), mapped)[0, 5, far] > 0
+
+
+@pytest.mark.parametrize(
+    ("speed", "confidence", "is_cut"),
+    [(90.0, 0.3, True), (90.0, 0.9, False), (10.0, 0.3, False)],
+)
+def test_a_link_is_cut_whose_ends_part_quickly_and_that_is_doubted(
+    speed: float, confidence: float, is_cut: bool
+) -> None:
+    """One UAV moves at ``speed`` away from others at 10 m/s; the cut works in m/s, not in their
+    logarithms, of which none is twice the mean."""
+    inputs, found, _, shift = step_of(7)
+    state = inputs.state.clone()
+    state[..., 3:] = torch.tensor([10.0, 0.0, 0.0]).double()
+    state[:, ::2, 3:] = torch.tensor([0.0, 10.0, 0.0]).double()
+    state[:, 5, 3:] = torch.tensor([0.0, 0.0, -speed]).double()
+    weight = inputs.links.mask.double() / STD**2
+    weight[:, 5], weight[:, :, 5] = confidence * weight[:, 5], confidence * weight[:, :, 5]
+    step = (replace(inputs, state=state), found, weight, shift)
+    layer, graph, mapped = attention_of(step)
+    others = graph.mask.clone()
+    others[:, 5] = False
+    to_it = others & (torch.arange(N) == 5)
+    share = layer.attention(graph, mapped)
+    assert to_it.any()
+    assert bool((share[to_it] == 0).all()) == is_cut
+    assert (share[graph.mask & ~to_it & others] > 0).all()
+    keeping, _, _ = attention_of(step, cut=False)
+    assert (keeping.attention(graph, mapped)[graph.mask] > 0).all()
 
 
 def test_information_and_pushed_displacements_are_sums_over_links() -> None:

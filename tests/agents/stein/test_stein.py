@@ -251,11 +251,11 @@ def test_the_window_is_a_queue_that_moves_along(poses: type[Poses]) -> None:
         team = poses.compose(team, moved)
         kept = window.propagate(poses, kept, moved.view(1, 1, n, -1), (0.01, 0.02))
         ends = torch.stack([torch.randperm(n, generator=g)[:2] for _ in range(2)])
-        told = torch.rand(2, generator=g) < 0.7
+        known = torch.rand(2, generator=g) < 0.7
         pose = poses.between(team[ends[:, 0]], team[ends[:, 1]])
-        new = window.Matches(*(v[None, None] for v in (ends[:, 0], ends[:, 1], pose, told)))
+        new = window.Matches(*(v[None, None] for v in (ends[:, 0], ends[:, 1], pose, known)))
         kept = window.insert(kept, new)
-        queue.extend([(*e, step) for e, t in zip(ends.tolist(), told.tolist(), strict=True) if t])
+        queue.extend([(*e, step) for e, t in zip(ends.tolist(), known.tolist(), strict=True) if t])
     held = kept.mask[0, 0]
     found = sorted(
         zip(kept.first[0, 0, held].tolist(), kept.second[0, 0, held].tolist(), strict=True)

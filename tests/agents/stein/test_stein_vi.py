@@ -35,7 +35,7 @@ def euroc(sequence: str = "V1_03_difficult", **overrides: Any) -> Scenario:
     return make_scenario("replay-stein-euroc-v0", sequence=sequence, **overrides)
 
 
-def flown(made: Scenario, agent: str, runs: int = 2) -> tuple[Tensor, Tensor, Any]:
+def localized(made: Scenario, agent: str, runs: int = 2) -> tuple[Tensor, Tensor, Any]:
     """Errors [R, K] in m, NEES [R, K], and the last belief."""
     localizer, world = make(agent, made), World(made, runs)
     observation, errors, nees = world.reset(0), [], []
@@ -218,10 +218,10 @@ def test_a_second_of_samples_is_more_than_their_mean() -> None:
 def test_false_matches_hurt_no_more_than_without() -> None:
     """Against the plain EKF, which believes them, and the gated one, which is as good."""
     made = euroc(span=(0.0, 15.0), false_matches=0.1)
-    ours, nees, belief = flown(made, "stein_vi")
-    plain, _, _ = flown(made, "ekf")
-    gated, _, _ = flown(made, "ekf:robust=gate")
-    dead, _, _ = flown(made, "dead_reckoning")
+    ours, nees, belief = localized(made, "stein_vi")
+    plain, _, _ = localized(made, "ekf")
+    gated, _, _ = localized(made, "ekf:robust=gate")
+    dead, _, _ = localized(made, "dead_reckoning")
     assert rms(ours[:, 20:]) < 0.05
     assert rms(ours[:, 20:]) < 1.15 * rms(gated[:, 20:])
     assert rms(plain[:, 20:]) > 2 * rms(ours[:, 20:])
@@ -232,7 +232,7 @@ def test_false_matches_hurt_no_more_than_without() -> None:
 
 def test_half_of_the_matches_wrong() -> None:
     made = euroc(span=(0.0, 10.0), false_matches=0.5, prior_std=0.5)
-    ours, _, belief = flown(made, "stein_vi:outliers=0.5")
+    ours, _, belief = localized(made, "stein_vi:outliers=0.5")
     assert rms(ours[:, 20:]) < 0.08
     assert belief.inliers.mean() < 0.75
 

@@ -16,7 +16,11 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.bounds import Bound, posterior_bound, range_information, worlds
 from coloc_env.bounds.expected import expected_information
-from coloc_env.bounds.information import own_information, shared_information
+from coloc_env.bounds.information import (
+    motion_information,
+    own_information,
+    shared_information,
+)
 from coloc_env.bounds.mixture import error_density
 from coloc_env.bounds.process import error_model, prior_covariance, strapdown_jacobians
 from coloc_env.geometry import (
@@ -43,17 +47,20 @@ from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import (
     GRAVITY,
     AnchorRanging,
+    ArrivalAngles,
     Height,
     Imu,
     Ins,
     LandmarkBearings,
     Landmarks,
     Odometry,
+    OpticalFlow,
     PositionFix,
     RangeNoise,
     Ranging,
     RecordedSensor,
     Sensor,
+    Tdoa,
     UavBearings,
 )
 from coloc_env.series import Series
@@ -266,7 +273,27 @@ def predicted_height(s: Height, p: Kinematics, seen: Observation) -> tuple[Tenso
 
 def predicted_fix(s: PositionFix, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
     mask = seen["position_fix_mask"][0].double()
-    return p.position[0], (mask / s.std**2).expand_as(p.position[0])
+    std = torch.tensor(s.axis_std(p.position.shape[-1]), dtype=torch.float64)
+    return p.position[0], mask / std**2
+
+
+def predicted_differences(s: Tdoa, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
+    anchors = torch.tensor(s.anchors, dtype=torch.float64)
+    far = (tag_places(p, s.tags).unsqueeze(2) - anchors).norm(dim=-1)
+    expected = torch.stack([far[..., n] - far[..., m] for m, n in s.pairs], -1).flatten(1)
+    return expected.repeat(1, s.depth), seen["tdoa_mask"][0].double() / s.std**2
+
+
+def predicted_angles(s: ArrivalAngles, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
+    mask = seen["arrival_angle_mask"][0].double().unflatten(-1, (s.depth, N))
+    std = torch.tensor((s.azimuth_std, s.elevation_std), dtype=torch.float64)
+    expected, weights = [], []
+    for i, j, d in product(range(N), range(N), range(s.depth)):
+        if i != j:
+            v = unrotate(p.attitude[0, i], p.position[0, j] - p.position[0, i])
+            expected.append(torch.stack((torch.atan2(v[1], v[0]), torch.asin(v[2] / v.norm()))))
+            weights.append(mask[i, d, j] / std**2)
+    return torch.stack(expected), torch.stack(weights)
 
 
 def tag_places(p: Kinematics, tags: tuple) -> Tensor:
@@ -326,6 +353,10 @@ CASES: list[tuple[Sensor, int, Callable]] = [
     (Height(0.1, dropout=0.3), 3, predicted_height),
     (PositionFix(0.3, count=2), 3, predicted_fix),
     (PositionFix(0.3, count=1), 2, predicted_fix),
+    (PositionFix(0.3, 2, vertical_std=0.7, dropout=0.3), 3, predicted_fix),
+    (Tdoa(ANCHORS, 0.2, TAGS, ((0, 1), (2, 0)), depth=2, dropout=0.3), 3, predicted_differences),
+    (Tdoa(PLANE_ANCHORS, 0.2, PLANE_TAGS, ((0, 1),)), 2, predicted_differences),
+    (ArrivalAngles(0.05, 0.1, dropout=0.3, depth=2), 3, predicted_angles),
     (AnchorRanging(ANCHORS, RangeNoise(0.3, dropout=0.3), TAGS), 3, predicted_anchors),
     (AnchorRanging(PLANE_ANCHORS, RangeNoise(0.3), PLANE_TAGS, radius=7.0), 2, predicted_anchors),
     (AnchorRanging(ANCHORS), 3, predicted_anchors),
@@ -366,6 +397,51 @@ def test_information_is_that_of_the_log_likelihood(case: tuple[Sensor, int, Call
         own = own_information(sensor, truth, seen)[0]
         found = torch.block_diag(*own).unflatten(1, (N, d))
     torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_information_of_flow_is_that_of_its_log_likelihood() -> None:
+    """Hᵀ R⁻¹ H about pose and velocity, by automatic differentiation."""
+    sensor = OpticalFlow(0.2)
+    truth, _ = first_step(scenario(sensor, motion=RandomVelocity()))
+    tilt = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    q = rotate_by(truth.attitude[0], tilt.expand(N, 3))
+    truth = replace(truth, attitude=q.unsqueeze(0))
+    seen = Observation({"flow_mask": torch.tensor([[[1.0], [0.0], [1.0]]])})
+
+    def flow(delta: Tensor, i: int) -> Tensor:
+        return unrotate(rotate_by(q[i], delta[3:6]), truth.velocity[0, i] + delta[6:9])[:2]
+
+    found = motion_information(sensor, truth, seen)[0]
+    for i in range(N):
+        h = torch.func.jacfwd(flow)(torch.zeros(9, dtype=torch.float64), i)
+        assert h.abs().max() > 0.5
+        wanted = float(seen["flow_mask"][0, i]) * h.mT @ h / 0.2**2
+        torch.testing.assert_close(found[i], wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_flow_sharpens_the_bound_by_the_velocity_that_it_shows() -> None:
+    """In an upright, standing team with a constant velocity, as a direct measurement of it."""
+    process = ConstantVelocity(accel_std=0.5)
+    places = ((3.0, 3.0, 1.0), (6.0, 3.0, 1.0))
+    quick = {"process": process, "n": 2, "motion": standing(*places)}
+    fix = PositionFix(1.0, count=2)
+    flow = posterior_bound(scenario(fix, OpticalFlow(0.1), **quick), 2, steps=40)
+    kalman = np.zeros((40, 3))
+    prior = Prior()
+    for axis in range(3):
+        p = np.diag([prior.position_std**2, prior.velocity_spread**2])
+        f = np.array([[1, 0.1], [0, 1]])
+        q = 0.25 * np.array([[0.1**3 / 3, 0.005], [0.005, 0.1]])
+        for k in range(40):
+            if k:
+                p = f @ p @ f.T + q
+            rows = [(np.array([1.0, 0.0]), 1.0)]
+            if axis < 2:
+                rows.append((np.array([0.0, 1.0]), 0.1))
+            information = np.linalg.inv(p) + sum(np.outer(h, h) / s**2 for h, s in rows)
+            p = np.linalg.inv(information)
+            kalman[k, axis] = p[0, 0]
+    assert flow.position[:, 0].numpy() == pytest.approx(np.sqrt(kalman.sum(1)), rel=1e-6)
 
 
 def test_false_matches_inform_of_the_landmark_they_show() -> None:

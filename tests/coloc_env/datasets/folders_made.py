@@ -72,6 +72,31 @@ def flying() -> Folder:
     return files
 
 
+def swarm() -> Folder:
+    """Two UAVs that listen to anchors, see each other's direction and the floor."""
+    rng = np.random.default_rng(4)
+    files = {
+        "recording.yaml": "dim: 3\nrobots: [a, b]\ntime: {unit: s}\n"
+        "map: {anchors: {north: [0, 5, 2], south: [0, -5, 2], up: [1, 1, 4]}}\n",
+    }
+    ends = ("north", "south", "up")
+    for name, other in (("a", "b"), ("b", "a")):
+        time = [f"{0.05 * i:.3f}" for i in range(40)]
+        files[f"{name}/truth.csv"] = table(
+            "stamp,x,y,z", [[t, *rng.normal(size=2), 1.5] for t in time]
+        )
+        files[f"{name}/tdoa.csv"] = table(
+            "stamp,from,to,difference",
+            [[t, ends[i % 3], ends[(i + 1) % 3], rng.normal()] for i, t in enumerate(time)],
+        )
+        files[f"{name}/angles.csv"] = table(
+            "stamp,robot,azimuth,elevation",
+            [[t, other, *rng.uniform(-1.5, 1.5, size=2)] for t in time],
+        )
+        files[f"{name}/flow.csv"] = table("stamp,vx,vy", [[t, *rng.normal(size=2)] for t in time])
+    return files
+
+
 def spreadsheet() -> Folder:
     """One tag, centimetres, milliseconds, semicolons, quotation marks, a TUM file."""
     rng = np.random.default_rng(3)
@@ -92,7 +117,7 @@ def spreadsheet() -> Folder:
     }
 
 
-FOLDERS = {"wheeled": wheeled, "flying": flying, "spreadsheet": spreadsheet}
+FOLDERS = {"wheeled": wheeled, "flying": flying, "swarm": swarm, "spreadsheet": spreadsheet}
 
 
 def write(home: Path, files: Folder) -> Path:
@@ -135,6 +160,8 @@ def plainly(home: Path) -> dict[str, tuple[int, float]]:
             }
             if "range" in values and not 0 < values["range"] * scale <= 1000:
                 continue
+            if "difference" in values and not abs(values["difference"] * scale) <= 1000:
+                continue
             if not all(np.isfinite(value) and abs(value) <= 1e9 for value in values.values()):
                 continue
             count += 1
@@ -144,13 +171,16 @@ def plainly(home: Path) -> dict[str, tuple[int, float]]:
     return found
 
 
-LENGTHS = ("x", "y", "z", "range", "height", "v")
+LENGTHS = ("x", "y", "z", "range", "height", "v", "difference", "vx", "vy")
 NUMBERS = {
-    "truth": ("x", "y"),
+    "truth": ("x", "y", "z"),
     "odometry": ("v", "omega"),
     "sightings": ("range",),
     "imu": ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"),
     "ranges": ("range", "own_tag"),
+    "tdoa": ("difference",),
+    "angles": ("azimuth", "elevation"),
+    "flow": ("vx", "vy"),
     "height": ("height",),
     "position_fix": ("x", "y", "z"),
 }

@@ -81,8 +81,12 @@ def loaded(recording: Recording) -> dict[str, tuple[int, float]]:
         add(robot, "truth", recording.truth[robot].position[:, :axes])
         for stream, team in recording.streams.items():
             values = team[robot].values
-            if stream in ("imu", "odometry", "height", "position_fix"):
+            if stream in ("imu", "odometry", "height", "position_fix", "flow"):
                 add(robot, stream, values)
+            elif stream == "tdoa":
+                add(robot, stream, values[:, 3:])
+            elif stream == "arrival_angles":
+                add(robot, "angles", values[:, 1:])
             elif stream.endswith("_ranges"):
                 add(robot, "ranges", values[:, [0, -1]])
             elif stream.endswith("_bearings"):

@@ -103,7 +103,7 @@ def test_velocity_is_the_derivative_of_position(name, dim, fly, arena):
     if dim == 2 and name not in FLAT:
         pytest.skip("3-D only")
     dt = 1e-3
-    truth = fly(ALL[name], arena(*ROOM[:dim], dt=dt), [5, 6], 30_000)
+    truth = fly(ALL[name], arena(*ROOM[:dim], dt=dt), [5, 6], 12_000)
     difference = (truth.position[:, 2:] - truth.position[:, :-2]) / (2 * dt)
     error = (difference - truth.velocity[:, 1:-1]).abs().amax((-1, -2))
     if name in JUMPY:

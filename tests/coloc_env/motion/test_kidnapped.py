@@ -143,14 +143,14 @@ def watched(
 ) -> tuple[Kinematics, Tensor]:
     """Truth and a leaf, [B, K, N, …]."""
     world = World(made, 2, window=window)
-    seen, told = world.reset(0), []
+    seen, record = world.reset(0), []
     width = 3 * made.arena.dim
     for _ in range(steps):
         truth = world.truth
-        told.append((truth.position, truth.velocity, truth.attitude, seen[leaf].double()))
+        record.append((truth.position, truth.velocity, truth.attitude, seen[leaf].double()))
         world.advance(torch.zeros(2, 3, width))
         seen = world.observation()
-    position, velocity, attitude, measured = (torch.stack(x, 1) for x in zip(*told, strict=True))
+    position, velocity, attitude, measured = (torch.stack(x, 1) for x in zip(*record, strict=True))
     return Kinematics(position, velocity, attitude), measured
 
 
@@ -242,8 +242,8 @@ def test_however_many_steps_are_sensed_at_once(window: int) -> None:
     motion = Kidnapped(MOTIONS["aggressive"], AT, (1,))
     for leaf, sensor in (("imu", Imu()), ("odometry", Odometry())):
         made = scenario(motion if leaf == "imu" else Kidnapped(MOTIONS["random"], AT), sensor)
-        (whole, told), (cut, found) = (watched(made, leaf, STEPS, w) for w in (None, window))
-        assert torch.equal(found, told)
+        (whole, expected), (cut, found) = (watched(made, leaf, STEPS, w) for w in (None, window))
+        assert torch.equal(found, expected)
         assert same(whole, cut)
 
 

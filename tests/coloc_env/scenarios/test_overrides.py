@@ -7,7 +7,7 @@ import torch
 
 from coloc_env.commands import SILENT, Commands
 from coloc_env.observation import action_width
-from coloc_env.scenarios import SCENARIOS, make_scenario, parse_override
+from coloc_env.scenarios import SCENARIOS, make_scenario, parse_overrides, parse_scenario
 from coloc_env.world import World
 
 RANGES: dict[str, Any] = {
@@ -54,6 +54,37 @@ CONTROL: dict[str, Any] = {
     "keep_apart": 9.0,
 }
 KIDNAPPING: dict[str, Any] = {"kidnap_at": 0.2, "kidnapped": (0,)}
+CARRIED: dict[str, Any] = {
+    "tags": 2,
+    "tag_arm": 0.3,
+    "tdoa_anchors": 5,
+    "tdoa_std": 0.5,
+    "tdoa_radius": 15.0,
+    "tdoa_dropout": 0.5,
+    "angles": True,
+    "azimuth_std": 0.2,
+    "elevation_std": 0.2,
+    "angle_field": 0.2,
+    "angle_radius": 5.0,
+    "angle_dropout": 0.5,
+    "gnss": True,
+    "gnss_std": 0.5,
+    "gnss_vertical_std": 5.0,
+    "gnss_outage": 0.5,
+    "gnss_outage_time": 0.2,
+    "gnss_off": (0.0, 0.2),
+    "gnss_dropout": 0.5,
+    "flow": True,
+    "flow_std": 0.5,
+    "flow_lowest": 3.0,
+    "flow_highest": 2.0,
+    "flow_dropout": 0.5,
+    "barometer": True,
+    "barometer_std": 0.5,
+    "barometer_drift": 2.0,
+    "barometer_time": 5.0,
+    "barometer_dropout": 0.5,
+}
 STEIN: dict[str, Any] = {
     "horizon": 17,
     "dt": 0.2,
@@ -85,6 +116,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "believed_imu_bias": True,
         "max_neighbours": 2,
         "walls": (14.0, 9.0, 0.0, 16.0, 11.0, 5.0),
+        **CARRIED,
         **TEAM,
         **LANDMARKS,
         **DELAYED,
@@ -177,6 +209,12 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "kidnapped": {"kidnap_at": 0.2},
         "accel_bias": {"imu_bias": True},
         "gyro_bias": {"imu_bias": True},
+        **{name: {"tdoa_anchors": 8} for name in ("tdoa_std", "tdoa_radius", "tdoa_dropout")},
+        **{name: {"angles": True} for name in CARRIED if name.startswith(("angle_", "azi", "ele"))},
+        **{name: {"gnss": True} for name in CARRIED if name.startswith("gnss_")},
+        **{name: {"flow": True} for name in CARRIED if name.startswith("flow_")},
+        **{name: {"barometer": True} for name in CARRIED if name.startswith("barometer_")},
+        "gnss_outage_time": {"gnss": True, "gnss_outage": 0.5},
     },
     "wsn-v0": {**RANGES_WITH, **FAILING, "kidnapped": {"kidnap_at": 0.2, "n_uavs": 2}},
     "swarm-v0": {
@@ -201,7 +239,7 @@ SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]
 
 
-def told(family: str, **overrides: Any) -> tuple[Any, ...]:
+def world_of(family: str, **overrides: Any) -> tuple[Any, ...]:
     """All that one world does in four steps, and what its team believes. UAVs that are steered are
     all sent one way; where they choose whom to call, UAV 0 calls 1, and 2 calls 3."""
     scenario = make_scenario(family, **SMALL.get(family, {}) | overrides)
@@ -221,6 +259,18 @@ def told(family: str, **overrides: Any) -> tuple[Any, ...]:
     return brought, scenario.horizon, scenario.believed, scenario.reference
 
 
+def test_an_override_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_overrides("indoor-v0", ["nlos=0.1", "horizon=9", "nlos=0.1"])
+    with pytest.raises(ValueError, match="indoor-v0: nlos is given twice"):
+        parse_scenario("indoor-v0:nlos=0.1:nlos=0.2")
+
+
+def test_a_variants_overrides_go_first() -> None:
+    scenario = parse_scenario("indoor-v0:nlos=0.1:horizon=9", "nlos=0.2")
+    assert scenario.overrides == {"nlos": 0.2, "horizon": 9}
+
+
 @pytest.mark.parametrize("family", CHANGED)
 def test_every_override_is_tried(family: str) -> None:
     assert set(CHANGED[family]) == set(SCENARIOS.options_of(family))
@@ -229,11 +279,11 @@ def test_every_override_is_tried(family: str) -> None:
 @pytest.mark.parametrize(("family", "name"), EACH)
 def test_every_override_changes_something(family: str, name: str) -> None:
     others = WITH[family].get(name, {})
-    assert told(family, **others) != told(family, **others, **{name: CHANGED[family][name]})
+    assert world_of(family, **others) != world_of(family, **others, **{name: CHANGED[family][name]})
 
 
 @pytest.mark.parametrize(("family", "name"), EACH)
 def test_every_override_is_read_from_the_command_line(family: str, name: str) -> None:
     value = CHANGED[family][name]
     text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    assert parse_override(family, f"{name}={text}") == (name, value)
+    assert parse_overrides(family, [f"{name}={text}"]) == {name: value}

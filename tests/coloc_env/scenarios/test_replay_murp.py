@@ -58,11 +58,11 @@ def distances(pose: Tensor) -> Tensor:
     return (there - HEXAGON.unsqueeze(1)).norm(dim=-1)
 
 
-def solve(ranges: Tensor, above: Tensor, std: float = 0.1, **told: Any) -> tuple[Tensor, Tensor]:
-    there = told.pop("there", torch.ones_like(ranges, dtype=torch.bool))
-    told = {"above_std": 0.1, "tilt_std": 0.05} | told
+def solve(ranges: Tensor, above: Tensor, std: float = 0.1, **options: Any) -> tuple[Tensor, Tensor]:
+    there = options.pop("there", torch.ones_like(ranges, dtype=torch.bool))
+    options = {"above_std": 0.1, "tilt_std": 0.05} | options
     return relative_poses(
-        ranges, there, (HEXAGON, HEXAGON), torch.full_like(above, std), above, **told
+        ranges, there, (HEXAGON, HEXAGON), torch.full_like(above, std), above, **options
     )
 
 
@@ -78,7 +78,7 @@ def test_clean_ranges_give_the_pose_back() -> None:
 
 
 def test_a_pose_and_its_mirror_image_have_the_same_ranges() -> None:
-    """M T M, M = diag(1, 1, −1): what is told of the height decides between the two."""
+    """M T M, M = diag(1, 1, −1): what is known of the height decides between the two."""
     true = poses(100)
     mirror = true * true.new_tensor((1, 1, -1, 1, -1, -1, 1))
     torch.testing.assert_close(distances(mirror), distances(true), rtol=0, atol=1e-12)
@@ -103,8 +103,8 @@ def test_the_minimum_and_its_covariance_against_scipy() -> None:
             ranged = (ranges[row] - distances(pose[None])[0]).flatten() / std
             scale = 2.4  # Cauchy's: scipy applies it to all residuals alike, so it is done here
             ranged = scale * ((ranged / scale).square().log1p()).sqrt() * ranged.sign()
-            told = torch.stack(((pose[2] - true[row, 2]) / 0.1, *(rotation[:2] / 0.05)))
-            return torch.cat((ranged, told)).numpy()
+            assumed = torch.stack(((pose[2] - true[row, 2]) / 0.1, *(rotation[:2] / 0.05)))
+            return torch.cat((ranged, assumed)).numpy()
 
         best = least_squares(lacking, [0.0] * 6, xtol=1e-12, ftol=1e-12, gtol=1e-12)
         assert abs(best.x).max() < 2e-3
@@ -182,7 +182,7 @@ def test_what_a_step_delivers() -> None:
 
 @pytest.mark.parametrize("share", [0.2, 0.4])
 def test_injected_outliers(share: float) -> None:
-    """As many as asked for, seen alike by both ends, uniform in the area, anew in each world."""
+    """As many as asked for, seen alike by both ends, uniform in the area, others in each world."""
     clean, made = scenario("16"), scenario("16", outliers=share)
     worlds = [World(each, 8) for each in (clean, made)]
     seen = [[world.reset(0)] for world in worlds]

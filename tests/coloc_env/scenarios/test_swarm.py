@@ -172,8 +172,8 @@ def test_a_weave_is_dense_and_the_other_motions_are_not() -> None:
         apart = (position[:, :, i] - position[:, :, j]).norm(dim=-1)
         close = apart < 100.0
         met[motion] = float(close.any(1).sum() * 2 / 200)  # others met by a UAV
-        begun = close[:, 1:] & ~close[:, :-1]
-        again[motion] = float(begun.sum() * 2 / 200)  # encounters of a UAV in 100 s
+        started = close[:, 1:] & ~close[:, :-1]
+        again[motion] = float(started.sum() * 2 / 200)  # encounters of a UAV in 100 s
         far = torch.full((200,), math.inf, dtype=torch.float64).diag()
         nearest[motion] = float((torch.cdist(position, position) + far).amin(-1).median())
     assert met["weave"] > 7.0
@@ -318,7 +318,7 @@ def test_a_row_of_a_batch_is_its_own_world_whatever_the_window(
 
 
 def test_rows_that_are_reset_alone_are_worlds_of_their_seeds() -> None:
-    """With what lasts over steps (biases, NLOS) begun anew."""
+    """With what lasts over steps (biases, NLOS) drawn again."""
     scenario = make_scenario("swarm-v0", **TROUBLE)
     fresh, world = World(scenario), World(scenario, 3, window=20)
     world.reset(0)

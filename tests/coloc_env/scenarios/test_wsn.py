@@ -30,22 +30,22 @@ def ranging(scenario: Scenario) -> tuple[AnchorRanging, AnchorRanging]:
     return true, believed
 
 
-def flown(scenario: Scenario, seeds: list[int], steps: int) -> tuple[Tensor, Tensor, Tensor]:
+def ranged(scenario: Scenario, seeds: list[int], steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """True positions [K, B, N, 2], and ranges and their masks [K, B, N, A]."""
-    world, told = World(scenario, len(seeds)), []
+    world, found = World(scenario, len(seeds)), []
     seen = world.reset(seeds)
     for _ in range(steps):
-        told.append((world.truth.position, seen["anchor_ranges"], seen["anchor_range_mask"]))
+        found.append((world.truth.position, seen["anchor_ranges"], seen["anchor_range_mask"]))
         world.advance(torch.zeros(len(seeds), scenario.arena.n_uavs, 6))
         seen = world.observation()
-    position, ranges, mask = (torch.stack(part) for part in zip(*told, strict=True))
+    position, ranges, mask = (torch.stack(part) for part in zip(*found, strict=True))
     return position, ranges, mask
 
 
 def errors(worlds: int = 40, steps: int = 60, **overrides: Any) -> tuple[Tensor, Tensor]:
     """Errors in m of the ranges [K, B, N, A], and which of these arrived."""
     scenario = make_scenario("wsn-v0", **overrides)
-    position, ranges, mask = flown(scenario, list(range(worlds)), steps)
+    position, ranges, mask = ranged(scenario, list(range(worlds)), steps)
     anchors = torch.tensor(ranging(scenario)[0].anchors, dtype=torch.float64)
     distance = (position.unsqueeze(-2) - anchors).norm(dim=-1)
     return ranges - distance, mask > 0
@@ -97,8 +97,8 @@ def test_anchors_stand_in_corners_then_along_walls(count: int) -> None:
 def test_several_robots_share_the_square_and_nothing_else() -> None:
     """Evenly spread along it, each with ranges of its own."""
     scenario = make_scenario("wsn-v0", n_uavs=4)
-    position, ranges, _ = flown(scenario, [3], 5)
-    alone, _, _ = flown(make_scenario("wsn-v0"), [3], 305)
+    position, ranges, _ = ranged(scenario, [3], 5)
+    alone, _, _ = ranged(make_scenario("wsn-v0"), [3], 305)
     for uav in range(4):
         torch.testing.assert_close(position[:, 0, uav], alone[100 * uav : 100 * uav + 5, 0, 0])
     noise = ranges[:, 0] - (position[:, 0].unsqueeze(-2) - torch.tensor(CORNERS)).norm(dim=-1)
@@ -156,7 +156,7 @@ def test_ranges_are_lost_one_by_one() -> None:
     assert float(there.double().mean()) == pytest.approx(0.8, abs=4 * (0.16 / count) ** 0.5)
     assert len(there.flatten(0, 2).unique(dim=0)) == 16
     scenario = make_scenario("wsn-v0", uwb_dropout=0.2)
-    _, ranges, mask = flown(scenario, [0], 60)
+    _, ranges, mask = ranged(scenario, [0], 60)
     assert not ranges[mask == 0].any()
 
 
@@ -174,7 +174,7 @@ def test_cases_differ_in_belief_alone(case: int) -> None:
     assert isinstance(process, ConstantVelocity)
     assert process.held
     assert process.accel_std**2 == pytest.approx(q)
-    assert torch.equal(flown(scenario, [0], 20)[1], flown(ideal, [0], 20)[1])
+    assert torch.equal(ranged(scenario, [0], 20)[1], ranged(ideal, [0], 20)[1])
 
 
 def test_beliefs_and_truth_are_set_apart() -> None:
@@ -217,8 +217,8 @@ def test_top_speeds_go_with_uniform_priors() -> None:
 
 
 def test_everyone_is_carried_across_the_room() -> None:
-    plain, _, _ = flown(make_scenario("wsn-v0", n_uavs=2), [0], 360)
-    moved, ranges, _ = flown(make_scenario("wsn-v0", n_uavs=2, kidnap_at=15.0), [0], 360)
+    plain, _, _ = ranged(make_scenario("wsn-v0", n_uavs=2), [0], 360)
+    moved, ranges, _ = ranged(make_scenario("wsn-v0", n_uavs=2, kidnap_at=15.0), [0], 360)
     assert torch.equal(moved[:150], plain[:150])
     torch.testing.assert_close(moved[150:], 10 - plain[150:], rtol=0, atol=1e-12)
     jump = (moved[150] - moved[149]).norm(dim=-1)
@@ -303,9 +303,9 @@ TROUBLE: dict[str, Any] = {
 def test_a_row_of_a_batch_is_its_own_world() -> None:
     scenario = make_scenario("wsn-v0", **TROUBLE)
     seeds = [5, 0, 9, 2**40, 7]
-    together = flown(scenario, seeds, 360)
+    together = ranged(scenario, seeds, 360)
     for row in (0, 3, 4):
-        alone = flown(scenario, seeds[row : row + 1], 360)
+        alone = ranged(scenario, seeds[row : row + 1], 360)
         for one, many in zip(alone, together, strict=True):
             assert torch.equal(one, many[:, row : row + 1])
 

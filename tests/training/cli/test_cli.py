@@ -47,7 +47,7 @@ def test_evaluate(tmp_path: Path) -> None:
     assert json.loads((out / "results.json").read_text())["bound"] == {"rmse": None}
 
 
-def test_what_raises_is_told(tmp_path: Path) -> None:
+def test_what_raises_is_reported(tmp_path: Path) -> None:
     done = evaluate(tmp_path / "out", "--agents", "test_still:wrong=raises", "--no-figures")
     assert done.exit_code == 0
     assert done.stderr == (
@@ -78,6 +78,7 @@ def test_what_raises_is_told(tmp_path: Path) -> None:
         (["render", "indoor-v0", "--agent", "ekff"], "did you mean 'ekf'"),
         (["scenarios", "indor-v0"], "did you mean 'indoor-v0'"),
         (["agents", "ekff"], "did you mean 'ekf'"),
+        (["recordings", "--agents", "ekf", "--only", "mrclan"], "did you mean 'mrclam'"),
     ],
 )
 def test_one_clear_line(
@@ -110,6 +111,13 @@ def test_output_is_checked_before_anything_is_computed(
     (tmp_path / "link").symlink_to(tmp_path / "file" / "nowhere")
     done = evaluate(tmp_path / "link", "--agents", "ekf")
     assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    monkeypatch.setattr("training.evaluation.score.score", lambda *_: pytest.fail("computed"))
+    inside = tmp_path / "file" / "a.json"
+    done = coloc("score", "survey-v0", "--policy", "random", "--out", inside)
+    assert (done.exit_code, done.stderr) == (2, f"error: {tmp_path / 'file'} is not a folder\n")
+    monkeypatch.setattr("training.evaluation.recordings.recorded", lambda: pytest.fail("computed"))
+    done = coloc("recordings", "--agents", "ekf", "--out", inside)
+    assert (done.exit_code, done.stderr) == (2, f"error: {tmp_path / 'file'} is not a folder\n")
     if os.geteuid():  # root may write anywhere
         (tmp_path / "closed").mkdir(mode=0o500)
         done = evaluate(tmp_path / "closed", "--agents", "ekf")
@@ -250,6 +258,8 @@ def test_lists() -> None:
     options = coloc("agents", "test_still").stdout
     assert "offset" in options
     assert "a number" in options
+    assert "(frontier)" in coloc("tasks").stdout
+    assert "frontier" in coloc("tasks", "survey-v0").stdout
 
 
 @pytest.mark.parametrize(
@@ -290,7 +300,7 @@ def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
                 break
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=120)
     finally:
         process.kill()
     assert (process.returncode, errors) == (130, b"interrupted\n")

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from coloc_env.options import typed
 from training.cli.command import app
-from training.evaluation.tables import typed
 from training.learning.registry import TRAININGS
 
 SMALL = ["--set", "scenario=indoor-v0:n_uavs=2:horizon=20", "--set", "worlds=1"]

@@ -65,6 +65,14 @@ def test_what_is_measured() -> None:
     assert "refused" in found["stgat"]
 
 
+def test_a_team_of_one_has_nothing_to_fuse() -> None:
+    agents = ("ekf:fusion=pairwise", "ekf_joint")
+    for n_uavs in (1, 2):
+        scenario = make_scenario("indoor-v0", n_uavs=n_uavs, horizon=3)
+        found = measure(scenario, agents, 1, 0)
+        assert ["refused" in found[agent] for agent in agents] == [n_uavs == 1] * 2
+
+
 def test_the_list(monkeypatch: pytest.MonkeyPatch) -> None:
     tuned = SimpleNamespace(tuned_on=("a",))
     made = [

@@ -28,6 +28,14 @@ def too_wide(seen: Seen) -> Tensor:
     return torch.zeros(*seen.observation.shape[:2], 3)
 
 
+def no_tensor(seen: Seen) -> list[float]:
+    return [0.0]
+
+
+def broken(seen: Seen) -> Tensor:
+    return seen.observation / (1 // 0)
+
+
 def not_a_number(seen: Seen) -> Tensor:
     return torch.full((*seen.observation.shape[:2], 2), float("nan"))
 
@@ -74,6 +82,13 @@ def test_a_policy_of_ones_own_scores_from_the_command_line(tmp_path: Path) -> No
         ("survey-v0", f"{__name__}:nothing", "has no attribute 'nothing'"),
         ("survey-v0", f"{__name__}:too_wide", "actions of shape (4, 4, 3) do not fit"),
         ("survey-v0", f"{__name__}:not_a_number", "holds NaN or infinity"),
+        ("survey-v0", f"{__name__}:no_tensor", "returns list, not a tensor"),
+        ("survey-v0", f"{__name__}:broken", "by zero (test_score.py, line "),
+        ("survey-v0", "os:system", "TypeError: expected str, bytes or os.PathLike object"),
+        ("survey-v0", "os:name", "'str' object is not callable"),
+        ("survey-v0", ".a:b", "relative import"),
+        ("survey-v0", ":b", "Empty module name"),
+        ("survey-v0:drift=0.1:drift=0.2", "frontier", "survey-v0: drift is given twice"),
     ],
 )
 def test_what_does_not_fit_is_one_line(task: str, policy: str, words: str) -> None:

@@ -296,7 +296,7 @@ def test_card_and_weights(unbroken: Path) -> None:
 
 def test_scores_are_those_of_the_three_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        training, "parse_scenario", lambda text: parse_scenario(f"{text}:horizon=4")
+        training, "parse_scenario", lambda text, more: parse_scenario(text, f"{more}:horizon=4")
     )
     reported: list[int] = []
     detector = untrained(FailureDetector, 0)

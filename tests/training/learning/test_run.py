@@ -14,10 +14,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from coloc_env import state_file
 from coloc_env.options import fits
 from training.learning import pfnn
 from training.learning import run as runs
-from training.learning import state as states
 from training.learning.collectors import EpochCollector
 from training.learning.registry import TRAININGS
 
@@ -85,8 +85,8 @@ def test_interrupted_in_saving(
             raise SystemExit
         keep(file, state)
 
-    keep = states.save
-    monkeypatch.setattr(states, "save", dies)
+    keep = state_file.save
+    monkeypatch.setattr(state_file, "save", dies)
     with pytest.raises(SystemExit):
         runs.start("pfnn", {"mode": mode} | SMALL, tmp_path / "run", quiet)
     monkeypatch.undo()
@@ -98,6 +98,7 @@ def test_interrupted_in_saving(
     assert not list((tmp_path / "run").rglob(".*"))
 
 
+@pytest.mark.slow
 def test_killed(mode: str, unbroken: dict[str, bytes], tmp_path: Path) -> None:
     """kill -9 of the command, somewhere in an epoch after the first."""
     settings = [f"--set={key}={value}" for key, value in ({"mode": mode} | SMALL).items()]
@@ -119,7 +120,7 @@ def test_killed(mode: str, unbroken: dict[str, bytes], tmp_path: Path) -> None:
     )
     state, deadline = out / "state.safetensors", time.monotonic() + 300
     while process.poll() is None and time.monotonic() < deadline:
-        if state.exists() and states.load(state)["trainer"]["collector"]["epoch"] >= 1:
+        if state.exists() and state_file.load(state)["trainer"]["collector"]["epoch"] >= 1:
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
@@ -182,10 +183,10 @@ def test_a_state_is_read_back_or_refused(tmp_path: Path) -> None:
         "optimizer": {"state": {0: {"step": torch.tensor(1.0)}}, "groups": [{"lr": 0.1}, None]},
     }
     file = tmp_path / "state.safetensors"
-    states.save(file, state)
+    state_file.save(file, state)
 
     def same() -> bool:
-        again = states.load(file)
+        again = state_file.load(file)
         return (
             all(
                 torch.equal(again["weights"][key], value) for key, value in state["weights"].items()
@@ -208,14 +209,14 @@ def test_a_state_is_read_back_or_refused(tmp_path: Path) -> None:
     for data in (whole[:-3], b"", whole[:40], whole + b"0"):
         file.write_bytes(data)
         with pytest.raises(ValueError, match=r"state.safetensors is damaged"):
-            states.load(file)
+            state_file.load(file)
 
 
 def test_a_state_without_checksum_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "state.safetensors"
     save_file({"0": torch.zeros(2)}, file, {"tree": '{"items": [["a", {"tensor": "0"}]]}'})
-    with pytest.raises(ValueError, match=r"has no checksum .*: the run must start again"):
-        states.load(file)
+    with pytest.raises(ValueError, match=r"has no checksum"):
+        state_file.load(file)
 
 
 def interrupted_run(folder: Path, interrupted: Callable[..., Any], **options: Any) -> None:
@@ -234,11 +235,11 @@ def test_a_state_of_other_options_is_refused(
     file.write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r'state of .*"epochs": 4.*describes .*"epochs": 5'):
         runs.resume(tmp_path / "run", quiet)
-    state = states.load(tmp_path / "run/state.safetensors")
+    state = state_file.load(tmp_path / "run/state.safetensors")
     config["options"]["epochs"] = 4
     file.write_text(json.dumps(config))
     del state["trainer"]["collector"]
-    states.save(tmp_path / "run/state.safetensors", state)
+    state_file.save(tmp_path / "run/state.safetensors", state)
     with pytest.raises(ValueError, match=r"state.safetensors does not fit this version's pfnn"):
         runs.resume(tmp_path / "run", quiet)
 
@@ -279,6 +280,7 @@ def test_weights_that_are_nan_are_an_error(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "run/pfnn.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_loses_nothing(
     unbroken: dict[str, bytes], mode: str, tmp_path: Path
 ) -> None:
@@ -289,12 +291,12 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
         import resource, sys, torch
         torch.set_num_threads(1)
         from training.cli.command import app
-        from training.learning import state
-        save = state.save
+        from coloc_env import state_file
+        save = state_file.save
         def full(*arguments):
             resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
             save(*arguments)
-        state.save = full
+        state_file.save = full
         settings = {[f"--set={key}={value}" for key, value in ({"mode": mode} | SMALL).items()]!r}
         app(["train", "pfnn", *settings, "--out", {str(out)!r}])
     """

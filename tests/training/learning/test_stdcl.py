@@ -257,26 +257,27 @@ def test_the_two_stages_and_the_cosine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("agent", "convolutions"), [("stdcl:feedback=none", True), ("stgat", True), ("stdcl", False)]
+    ("agent", "levels"),
+    [("stdcl:feedback=none", 3), ("stgat", 3), ("stdcl", 0), ("stdcl:variant=paper", 2)],
 )
 def test_card_and_weights(
-    agent: str, convolutions: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    agent: str, levels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "SCORED", ("n_uavs=12:horizon=5",))
-    options = {**SMALL, "epochs": 1, "score_runs": 1, "agent": agent, "convolutions": convolutions}
+    options = {**SMALL, "epochs": 1, "score_runs": 1, "agent": agent, "levels": levels}
     weights = runs.start("stdcl", options, tmp_path / "run", quiet)
     card = json.loads(weights.with_suffix(".json").read_text())
     assert card["kind"] == "stgnn"
     assert card["features"] == list(StGnn.features)
     assert card["architecture"]["kinematic"] == (agent != "stgat")
-    assert card["architecture"]["temporal"] == convolutions
+    assert card["architecture"]["levels"] == levels
     assert card["metrics"]["optim_steps"] == BATCHES
     (found,) = card["scores"]["rmse"].values()
     assert found.keys() == {"trained_rmse", "optimizer_rmse"}
     name = agent.split(":")[0]
     localizer: Any = make(name, make_scenario("swarm-v0", n_uavs=12), weights=str(weights))
     assert all(weight.isfinite().all() for weight in localizer.network.state_dict().values())
-    assert bool(len(localizer.network.times)) == convolutions
+    assert len(localizer.network.times) == levels
 
 
 @pytest.mark.parametrize(

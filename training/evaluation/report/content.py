@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from coloc_env.options import typed
 from coloc_env.render.style import UAV_COLOURS
 from training.evaluation import metrics
 from training.evaluation.ellipsoids import half_axes, in_space
 from training.evaluation.metrics import Floats
 from training.evaluation.runs import Method, Runs
-from training.evaluation.tables import COLUMNS, typed
+from training.evaluation.tables import COLUMNS
 
 _FRAMES = 400  # of the player, at most
 _POINTS = 1500  # of a curve, at most

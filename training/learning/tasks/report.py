@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from agents.tasks import TASKS, make_task
+from coloc_env.options import typed
 from training.evaluation.score import FIRST_SEED, WORLDS
-from training.evaluation.tables import typed
 from training.learning import curves
 from training.learning.registry import TRAININGS
 

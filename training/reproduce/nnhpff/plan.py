@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from coloc_env.scenarios import parse_override
+from coloc_env.scenarios import parse_overrides
 from training.evaluation import metrics
 from training.evaluation.metrics import Flags, Floats
 from training.learning.nnhpff import FAILED, MAINS, VARIANTS
@@ -228,7 +228,7 @@ def _open_loop(main: str) -> str:
 
 def _variant(kind: str, text: str, steps: int | None) -> Variant:
     """A variant of wsn-v0 from overrides as on a command line."""
-    overrides = tuple(parse_override("wsn-v0", one) for one in text.split(":"))
+    overrides = tuple(parse_overrides("wsn-v0", text.split(":")).items())
     return Variant(
         f"{kind}-{text.replace(':', '-')}", text.replace(":", ", "), overrides, "wsn-v0", steps
     )

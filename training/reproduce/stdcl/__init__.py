@@ -3,7 +3,16 @@ adds, and recordings."""
 
 from functools import partial
 
-from training.reproduce.stdcl import claims, figures, goals, loop_figures, plan, tables
+from training.reproduce.stdcl import (
+    claims,
+    figures,
+    goals,
+    loop_claims,
+    loop_figures,
+    plan,
+    tables,
+    theory_part,
+)
 from training.reproduce.study import Part, Study
 
 
@@ -32,10 +41,18 @@ def stdcl(*, n_uavs: int = 200) -> Study:
         "The learned part",
         partial(plan.learned, n_uavs),
         tables.learned_text,
-        claims.loop,
+        loop_claims.loop,
         goals.goals,
         tables.learned,
         loop_figures.LEARNED,
+    )
+    theory = Part(
+        "Theory and settings",
+        partial(theory_part.cells, n_uavs),
+        theory_part.text,
+        theory_part.claims,
+        tables=theory_part.tables,
+        figures=theory_part.FIGURES,
     )
     campus = Part(
         "Flights over a campus, simulated",
@@ -48,6 +65,7 @@ def stdcl(*, n_uavs: int = 200) -> Study:
     )
     real = Part("Recordings", partial(plan.real, n_uavs), tables.real_text, tables=tables.real)
     parts = {
-        "paper": own, "stress": stress, "learned": learned, "campus": campus, "real": real
+        "paper": own, "stress": stress, "learned": learned, "theory": theory, "campus": campus,
+        "real": real,
     }  # fmt: skip
     return Study("stdcl", "ST-DCL", plan.TITLE, 50, parts)

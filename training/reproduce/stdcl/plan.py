@@ -11,7 +11,9 @@ TITLE = "Spatio-temporally decoupled cooperative localization, *Drones* 2026, 10
 WHOLE, OPTIMIZER, HUBER = "stdcl", "dwmds_st", "dwmds_st:confidence=huber"
 RIVALS = ("mds", "fcmds", "dwmds", "vmds")  # the paper's, in its order
 LEARNED = "stgat"
-METHODS = (*RIVALS, LEARNED, HUBER, OPTIMIZER, WHOLE)
+# The paper's own: Huber's loss times equation 17, corrections, the feedback of equation 36.
+PAPERS_OPTIMIZER, PAPERS_LOOP = "dwmds_st:confidence=paper", "stdcl:variant=paper"
+METHODS = (*RIVALS, LEARNED, HUBER, OPTIMIZER, WHOLE, PAPERS_LOOP)
 REFERENCES = ("gn", "map")  # expensive: they run in fewer worlds
 # Step by step from the optimizer to the whole, each with weights trained as it is used.
 ABLATION = {
@@ -21,13 +23,22 @@ ABLATION = {
 }
 OPEN = "stdcl:weights=stdcl_open:feedback=none"  # trained with the loop open, used so
 UNFED = "stdcl:feedback=none"  # the whole's own weights, with the loop cut
-PAPERS_FEEDBACK = "stdcl:feedback=paper"
+# Of the paper's own, each with weights trained in its own loop.
+PAPERS_UNFED = "stdcl:variant=paper:feedback=none"
+PAPERS_FEEDBACK = "stdcl:variant=paper:weights=none"  # equation 36 alone, without a network
+PAPERS_LEARNED = "stdcl:variant=paper:feedback=learned:weights=stdcl_paper_learned"
 CLOSED_AFTERWARDS = "stdcl:weights=stdcl_open:feedback=positions"
 LOOPS = {
     OPEN: "trained without feedback",
     UNFED: "whole, loop cut",
-    PAPERS_FEEDBACK: "whole, feedback of eq. 36",
     CLOSED_AFTERWARDS: "trained without, positions fed back",
+}
+PAPERS = {
+    PAPERS_OPTIMIZER: "the paper's optimizer alone",
+    PAPERS_FEEDBACK: "+ feedback of eq. 36, no network",
+    PAPERS_LOOP: "+ network trained in that loop: the paper's whole",
+    PAPERS_UNFED: "the same, loop cut",
+    PAPERS_LEARNED: "network trained with learned feedback",
 }
 CONFIDENCES = ("none", "paper", "huber")  # beside the optimizer's own, calibrated
 
@@ -40,7 +51,8 @@ FAILURES = (0.25, 0.4)
 GROWTH = (20, 50, 100, 200, 500, 1000)
 JOINT_UP_TO = 200  # UAVs: beyond, full covariances are not timed
 CONFIDENCES_OF = tuple(f"{OPTIMIZER}:confidence={c}" for c in CONFIDENCES)
-WATCHED = (WHOLE, OPTIMIZER, f"{OPTIMIZER}:confidence=none")  # whose links are recorded
+# Whose links are recorded.
+WATCHED = (WHOLE, PAPERS_LOOP, OPTIMIZER, f"{OPTIMIZER}:confidence=none")
 FLIGHTS = {"s1": "S1: formation over the court", "s2": "S2: split", "s3": "S3: patrol"}
 LONG = 1000  # steps of the loop's long run
 
@@ -221,9 +233,11 @@ def learned(n_uavs: int, settings: Settings) -> Iterator[Cell]:
     """What each part of the network adds, what the loop does, and whether it is stable."""
     worlds, some = _worlds(n_uavs, settings), settings.fraction(10)
     for variant in (worlds.speed(MODERATE), *worlds.held_out().values()):
-        yield Cell(variant, (HUBER, *ABLATION, *LOOPS), some)
+        yield Cell(variant, (HUBER, *ABLATION, *LOOPS, *PAPERS), some)
     yield Cell(worlds.long(), (OPTIMIZER, WHOLE, UNFED), some)
-    yield Cell(worlds.long(), (WHOLE,), 1, LOOP)
+    for variant in (worlds.speed(MODERATE), worlds.lasting(0.15), worlds.lasting(0.5)):
+        yield Cell(variant, tuple(PAPERS), some)
+    yield Cell(worlds.long(), (WHOLE, PAPERS_LOOP), 1, LOOP)
 
 
 def campus(n_uavs: int, settings: Settings) -> Iterator[Cell]:

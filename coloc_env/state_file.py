@@ -1,4 +1,5 @@
-"""A training's resumable state: everything that it needs to go on, in one file, without pickle.
+"""The resumable state of a training or of a running localizer: everything that it needs to go on,
+in one file, without pickle.
 
 Tensors are kept by safetensors; all else is JSON in that file's header, beside a SHA-256 of both.
 One file, renamed into place, is either the old state or the new one, whenever the process dies.
@@ -28,7 +29,8 @@ def save(file: Path, state: Mapping[str, Any]) -> None:
 
 def load(file: Path) -> dict[str, Any]:
     """The state that ``save`` wrote, every bit of it; tuples come back as lists. Raises ValueError
-    if it has changed since, or has no checksum, as those of coloc 0.1 had none."""
+    if it has changed since, or has no checksum, as those of coloc 0.1 had none; OSError if it
+    cannot be read."""
     try:
         with safe_open(file, "pt") as opened:
             header = opened.metadata() or {}
@@ -36,10 +38,7 @@ def load(file: Path) -> dict[str, Any]:
     except (SafetensorError, TypeError, ValueError) as error:
         raise ValueError(f"{file} is damaged: {type(error).__name__}: {error}") from None
     if "tree" not in header or "sha256" not in header:
-        raise ValueError(
-            f"{file} has no checksum (an older coloc wrote it, or it is damaged): "
-            "the run must start again"
-        )
+        raise ValueError(f"{file} has no checksum: an older coloc wrote it, or it is damaged")
     if _sha256(header["tree"], tensors) != header["sha256"]:
         raise ValueError(f"{file} is damaged: its SHA-256 differs from what was written")
     return _unpack(json.loads(header["tree"]), tensors)

@@ -1,0 +1,1 @@
+"""Learned factors of ranges: what a graph network says about ``map``'s Gaussian sites."""

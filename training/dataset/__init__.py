@@ -1,0 +1,1 @@
+"""Datasets for learning elsewhere: runs of a scenario as Parquet and as TensorDict memmaps."""
