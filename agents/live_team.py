@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 from torch.nn.functional import pad
 
+from coloc_env.datasets.corrections import corrected
 from coloc_env.datasets.grid import Grid
 from coloc_env.datasets.live import LiveSamples, setup_recording
-from coloc_env.datasets.noise_model import corrected
 from coloc_env.datasets.open_format.description import FILE, read_description
 from coloc_env.datasets.recording import DataError, Recording
 from coloc_env.datasets.replay import arena_of

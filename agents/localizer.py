@@ -1,6 +1,7 @@
 """The Localizer protocol and its estimates."""
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorClass
 from torch import Tensor, nn
 
 from agents.models.measurements import MODELS
-from agents.models.process import drives
+from agents.models.process import Process, drives, make_process
 from agents.parts import parts_of
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -107,6 +108,20 @@ class Localizer(ABC, Generic[Belief]):
     def mean(self, belief: Belief) -> Float[Tensor, "B N S"]:
         """The mean state of a belief, as ``agents.models.process`` lays states out."""
         raise ValueError(f"{self.name} has no mean state")
+
+    def attitude(self, belief: Belief) -> Float[Tensor, "B N a"] | None:
+        """The attitudes of a belief's mean state (quaternion wxyz, body to world, or heading in
+        rad); None where they are not estimated."""
+        try:
+            motion = self._motion
+            return motion.attitude(self.mean(belief)) if motion.attitude_size else None
+        except ValueError:
+            return None
+
+    @cached_property
+    def _motion(self) -> Process:
+        """The believed motion model, which lays mean states out."""
+        return make_process(self.believed)
 
     def shifted(self, belief: Belief, offset: Float[Tensor, "B N d"]) -> Belief:
         """The belief with its position shifted by ``offset`` (m), as sure of it as before."""

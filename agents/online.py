@@ -255,12 +255,8 @@ class OnlineLocalizer:
         return self._start + k * self._period
 
     def _located(self, k: int, belief: Any, estimate: Estimate) -> Located:
-        d = self._team.believed.arena.dim
-        try:
-            state = self.localizer.mean(belief)
-            attitude = state[0, :, 2 * d : 2 * d + (1 if d == 2 else 4)].numpy()
-        except ValueError:
-            attitude = None
+        turned = self.localizer.attitude(belief)
+        attitude = None if turned is None else turned[0].numpy()
         position, velocity, covariance = (
             each[0].double().numpy()
             for each in (estimate.position, estimate.velocity, estimate.covariance)

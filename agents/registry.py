@@ -22,6 +22,7 @@ LOCALIZERS = Registry(
         "dead_reckoning": "agents.kalman.dead_reckoning:DeadReckoning",
         "dfgo": "agents.factor_graph.dfgo:DistributedFactorGraph",
         "dfgo_central": "agents.factor_graph.dfgo_central:CentralFactorGraph",
+        "dlspf": "agents.particle.dlspf:LatentParticleFilter",
         "dwmds": "agents.swarm.dwmds:CostaMds",
         "dwmds_st": "agents.swarm.dwmds_st:DynamicMds",
         "ekf": "agents.kalman.ekf:CooperativeEkf",
@@ -48,6 +49,7 @@ LOCALIZERS = Registry(
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
         "stdcl_factors": "agents.stdcl.factors.localizer:LearnedFactors",
         "stgat": "agents.stdcl.stgat:StGat",
+        "ukf": "agents.kalman.ukf:UnscentedFilter",
         "vmds": "agents.swarm.vmds:VelocityMds",
     },
 )

@@ -152,10 +152,10 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         precision, vector = x.new_zeros(*x.shape[:3], e, e), x.new_zeros(*x.shape[:3], e)
         if blocks:
             precision, vector = information(blocks, [self._trust(block) for block in blocks])
-        motion = self._motion(x, belief, leaves)
+        motion = self._steps(x, belief, leaves)
         return smooth(Chain(motion[0], belief.prior_covariance, *motion[1:], precision, vector))
 
-    def _motion(
+    def _steps(
         self, x: Float64[Tensor, "B N W S"], belief: SmootherBelief, leaves: Observation
     ) -> tuple[
         Float64[Tensor, "B N E"],

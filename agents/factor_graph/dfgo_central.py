@@ -73,7 +73,7 @@ class CentralFactorGraph(DistributedFactorGraph):
             weighted = (h * weight.unsqueeze(-1)).mT
             precision = precision + weighted @ h
             vector = vector + (weighted @ residual.unsqueeze(-1))[..., 0]
-        mean, f, offset, q = self._motion(x, belief, leaves)
+        mean, f, offset, q = self._steps(x, belief, leaves)
         found = smooth(
             Chain(
                 mean.flatten(1),

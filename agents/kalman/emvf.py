@@ -18,6 +18,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.measurements import (
     AnchorRanges,
     Block,
+    RangeDifferences,
     make_measurements,
     model_of,
     no_neighbours,
@@ -28,7 +29,7 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
-from coloc_env.sensors import AnchorRanging
+from coloc_env.sensors import AnchorRanging, Tdoa
 from coloc_env.sensors.base import Layout
 
 _NOTHING = 1e-6  # m⁻², s²/m²: information on position and velocity before anything is measured
@@ -85,14 +86,18 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
             raise ValueError("the team measures nothing of its own to estimate from")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
-        self.normal = _normal(believed)
-        if self.normal is not None and all(isinstance(m, AnchorRanges) for m in self.models):
-            self._require_one_side(self.normal)
+        anchors, dim = believed.sensor(AnchorRanging), believed.arena.dim
+        self.normal = _normal(anchors, dim)
+        for kind, sensor in ((AnchorRanges, anchors), (RangeDifferences, believed.sensor(Tdoa))):
+            if sensor is not None and all(isinstance(m, kind) for m in self.models):
+                self._require_one_side(sensor)
 
-    def _require_one_side(self, normal: Float64[Tensor, "d"]) -> None:
-        """ValueError if the room lies on both sides of the anchors' plane."""
-        sensor, arena = self.believed.sensor(AnchorRanging), self.believed.arena
-        assert sensor is not None
+    def _require_one_side(self, sensor: AnchorRanging | Tdoa) -> None:
+        """ValueError if all anchors lie in a plane, and the room on both sides of it."""
+        arena = self.believed.arena
+        normal = _normal(sensor, arena.dim)
+        if normal is None:
+            return
         corners = torch.cartesian_prod(*torch.tensor((arena.low, arena.high)).double().T)
         side = (corners - torch.tensor(sensor.anchors[0])) @ normal
         low, high = -float(side.min()), float(side.max())
@@ -280,10 +285,9 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         return centre + place
 
 
-def _normal(believed: Believed) -> Float64[Tensor, "d"] | None:
+def _normal(sensor: AnchorRanging | Tdoa | None, dim: int) -> Float64[Tensor, "d"] | None:
     """Unit normal of the plane (in the plane: line) that all anchors lie in; None if none does."""
-    sensor = believed.sensor(AnchorRanging)
-    if sensor is None or len(sensor.anchors) < believed.arena.dim:
+    if sensor is None or len(sensor.anchors) < dim:
         return None
     places = torch.tensor(sensor.anchors, dtype=torch.float64)
     _, spread, axes = torch.linalg.svd(places - places.mean(0))

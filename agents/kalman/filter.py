@@ -110,7 +110,7 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
-        x, covariance, f = predict(self.process, belief, observation)
+        x, covariance, f = self.predict(belief, observation)
         prior = Prediction(x, covariance, observation, belief.memory)
         considered = self.biases.predict(belief.considered, f, observation)
         beside = Beside(considered, self.moved(belief.shared, f), belief.step)
@@ -127,6 +127,12 @@ class GaussianFilter(Localizer[GaussianBelief]):
         )
         honest = reported(covariance, beside.considered)
         return after, gaussian_estimate(self.process, x, honest)
+
+    def predict(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N E E"]]:
+        """Mean and covariance before the measurements are used, and the transition F."""
+        return predict(self.process, belief, observation)
 
     def mean(self, belief: GaussianBelief) -> Float[Tensor, "B N S"]:
         return belief.state

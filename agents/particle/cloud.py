@@ -2,12 +2,11 @@
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
-
-from agents.models.process import Process
 
 
 def effective_sample_size(log_weights: Float[Tensor, "*s M"]) -> Float[Tensor, "*s"]:
@@ -27,6 +26,22 @@ def select(x: Float[Tensor, "B N M k"], index: Int64[Tensor, "B N m"]) -> Float[
     return first.gather(-1, index.expand(len(first), *index.shape)).movedim(0, -1)
 
 
+class Manifold(Protocol):
+    """Where particles live: x ⊞ δ, errors x ⊟ y of ``error_size``; ``noise_size`` numbers are a
+    step's noise."""
+
+    error_size: int
+    noise_size: int
+
+    def boxplus(
+        self, x: Float[Tensor, "*s S"], delta: Float[Tensor, "*s E"]
+    ) -> Float[Tensor, "*s S"]: ...
+
+    def boxminus(
+        self, x: Float[Tensor, "*s S"], y: Float[Tensor, "*s S"]
+    ) -> Float[Tensor, "*s E"]: ...
+
+
 @dataclass(frozen=True)
 class Moments:
     """A weighted cloud's mean and error covariance, and what they were made from: every particle's
@@ -39,7 +54,7 @@ class Moments:
 
 
 def moments(
-    process: Process, particles: Float32[Tensor, "B N M S"], weights: Float32[Tensor, "B N M"]
+    space: Manifold, particles: Float32[Tensor, "B N M S"], weights: Float32[Tensor, "B N M"]
 ) -> Moments:
     """Weighted mean and covariance; a heavy particle anchors the mean of attitudes, whose tangents
     are averaged about it.
@@ -48,13 +63,13 @@ def moments(
     drags along must not show.
     """
     anchor = select(particles, weights.argmax(-1, keepdim=True))
-    apart = process.boxminus(particles, anchor)
+    apart = space.boxminus(particles, anchor)
     exact = apart.double()
     scaled = exact * weights.unsqueeze(-1)
     first = scaled.sum(-2)
     covariance = exact.mT @ scaled - first.unsqueeze(-1) * first.unsqueeze(-2)
     shift = first.to(apart.dtype)
-    return Moments(process.boxplus(anchor[..., 0, :], shift), covariance, apart, shift)
+    return Moments(space.boxplus(anchor[..., 0, :], shift), covariance, apart, shift)
 
 
 def systematic(
@@ -81,7 +96,7 @@ def systematic(
 
 
 def liu_west(
-    process: Process,
+    space: Manifold,
     cloud: Moments,
     ancestors: Int64[Tensor, "B N M"],
     noise: Float32[Tensor, "B N M E"],
@@ -95,4 +110,4 @@ def liu_west(
     factor = torch.linalg.cholesky_ex(spread).L.to(noise.dtype)
     apart = select(cloud.apart, ancestors) - cloud.shift.unsqueeze(-2)
     moved = math.sqrt(1 - shrink**2) * apart + (factor @ noise.mT).mT
-    return process.boxplus(cloud.mean.unsqueeze(-2), moved)
+    return space.boxplus(cloud.mean.unsqueeze(-2), moved)

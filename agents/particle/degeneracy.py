@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from agents.particle import particle_count
-from agents.particle.belief import ParticleBelief, Step
+from agents.particle.belief import Step
 from agents.particle.cloud import effective_sample_size
 from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import RESAMPLE, Resampling
@@ -19,13 +19,13 @@ _FEW = 0.1  # the share below which particles are redrawn later
 
 
 def degenerate(
-    log_weights: Float32[Tensor, "B N M"], belief: ParticleBelief
+    log_weights: Float32[Tensor, "B N M"], count: Int64[Tensor, "B N"], step: Int64[Tensor, "B N"]
 ) -> Bool[Tensor, "B N"]:
     """Whether weights are those of too few particles: an effective sample size below half of the
     count in the first steps, below a tenth later."""
-    share = torch.full_like(belief.step, _FEW, dtype=torch.float32)
-    share = share.masked_fill(belief.step < _START, RESAMPLE)
-    return effective_sample_size(log_weights) < share * belief.count
+    share = torch.full_like(step, _FEW, dtype=torch.float32)
+    share = share.masked_fill(step < _START, RESAMPLE)
+    return effective_sample_size(log_weights) < share * count
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Rejuvenation:
             particles, log_weights, gain = self.redraw(particles, log_weights, gain, late, density)
         if bool(early.any()):
             evidence, resampling, now = self.evidence, self.resampling, self.now
-            used = tempered(particles, log_weights, gain, early, evidence, resampling, now)
+            count, key = now.belief.count, now.key
+            used = tempered(particles, log_weights, gain, early, evidence, resampling, count, key)
             return *used, late
         return particles, log_weights + gain, late
 
@@ -77,10 +78,12 @@ class Rejuvenation:
         """For the UAVs marked in ``rows``: particles drawn from the density, their log-weights,
         and their log-likelihoods. Where even those are degenerate, the density's posterior stands
         as drawn."""
-        drawn, ratio = draw(self.resampling.process, density, self.now, particles.shape[-2])
+        drawn, ratio = draw(self.screen.process, density, self.now, particles.shape[-2])
         particles = torch.where(rows[..., None, None], drawn, particles)
         log_weights = torch.where(rows.unsqueeze(-1), ratio, log_weights)
         gain = torch.where(rows.unsqueeze(-1), self.evidence(particles, log_weights), gain)
-        lost = (rows & degenerate(log_weights + gain, self.now.belief)).unsqueeze(-1)
+        before = self.now.belief
+        few = degenerate(log_weights + gain, before.count, before.step)
+        lost = (rows & few).unsqueeze(-1)
         equal = particle_count.equal_log_weights(log_weights > -torch.inf)
         return particles, torch.where(lost, equal, log_weights), gain.masked_fill(lost, 0.0)

@@ -98,7 +98,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
         made = PrintedResampling(self.process, perturb_std, bounds) if self.printed else None
-        self.resampling = made or Resampling(self.process, perturb, bounds)
+        self.resampling = made or Resampling.of(self.process, perturb, bounds)
         self.compiled = compile
         if compile:
             self._foresee = torch.compile(self._foresee, dynamic=False)  # type: ignore[method-assign]
@@ -282,7 +282,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """Whose weights are those of too few particles, which tempering would mend."""
         if not self.tempering:
             return torch.zeros_like(log_weights[..., 0], dtype=torch.bool)
-        return degenerate(log_weights, now.belief)
+        return degenerate(log_weights, now.belief.count, now.belief.step)
 
     def _evidence(
         self,

@@ -13,6 +13,7 @@ from agents.models.measurements import (
     Measurement,
     Neighbours,
     UavRanges,
+    per_state,
 )
 from agents.models.process import Process
 from agents.robust import Trust
@@ -108,11 +109,8 @@ def log_likelihood(
             ranges, points = model.ends(observation, near)
             total = total + range_log_likelihood(block, ranges, particles[..., :d], points, trust)
             continue
-        wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
-        spread = Neighbours(
-            near.position.unsqueeze(2), near.variance.unsqueeze(2), near.known.unsqueeze(2)
-        )
-        block = model.linearize(process, particles, wide, spread, derivatives=False)
+        around = per_state(observation, near)
+        block = model.linearize(process, particles, *around, derivatives=False)
         trust = _per_particle(trust, total.dtype)
         variance = block.total_variance
         squared = trust.residual(block) ** 2 / variance

@@ -27,10 +27,9 @@ class PrintedResampling(Resampling):
     def __init__(
         self, process: Process, perturb_std: float, bounds: tuple[int, int] | None
     ) -> None:
-        super().__init__(process, "fixed", bounds)
         std = dict.fromkeys(("velocity", "attitude"), _SHARE * perturb_std)
         std |= {"position": perturb_std, "accel": 0.0, "gyro": 0.0}
-        self.perturb = torch.tensor(per_error(process, std), dtype=torch.float32)
+        super().__init__(process, per_error(process, std), bounds, 0.0)
 
     def weigh(
         self,
@@ -51,17 +50,17 @@ class PrintedResampling(Resampling):
         key: Int64[Tensor, "B N"],
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
         few, target = self.few(weighed, count), weighed.target
-        std, m = self.perturb.to(draws.device), particles.shape[-2]
+        std, m = self.floor.to(draws), particles.shape[-2]
         ancestors = systematic(weighed.weights, noise.unit(key), count)  # lines 1 to 7
-        moved = self.process.boxplus(select(particles, ancestors), std * draws)  # 9 to 12
+        moved = self.space.boxplus(select(particles, ancestors), std * draws)  # 9 to 12
         if bool((target > count).any()):  # 20: new ones perturb existing ones, evenly spaced
             slot = torch.arange(m, device=draws.device)
             fresh = slot - count.unsqueeze(-1)
             step = count.unsqueeze(-1) // (target - count).clamp_min(1).unsqueeze(-1)
             parent = torch.where(fresh < 0, slot, fresh * step).clamp_max(m - 1)
-            more = normal(key, "pf.add", self.process.error_size, m)
+            more = normal(key, "pf.add", self.space.error_size, m)
             more = more.masked_fill((fresh < 0).unsqueeze(-1), 0.0)
-            moved = self.process.boxplus(select(moved, parent), std * more)
+            moved = self.space.boxplus(select(moved, parent), std * more)
         equal = particle_count.equal_log_weights(particle_count.alive(target, m))  # 14 and 15
         particles = torch.where(few[..., None, None], moved, particles)
         return particles, torch.where(few.unsqueeze(-1), equal, weighed.log_weights)
@@ -73,7 +72,7 @@ class PrintedResampling(Resampling):
         log_weights: Float32[Tensor, "B N M"],
     ) -> Moments:
         """The resampled cloud (Algorithm 1, lines 26 and 27)."""
-        return moments(self.process, particles, log_weights.exp())
+        return moments(self.space, particles, log_weights.exp())
 
 
 def anywhere(believed: Believed) -> Believed:

@@ -1,5 +1,6 @@
 """From a weighted cloud to the next step's particles: moments, resampling, counts that adapt."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,10 +11,11 @@ from torch import Tensor
 from agents.models.process import Process
 from agents.particle import particle_count
 from agents.particle.belief import normal
-from agents.particle.cloud import Moments, liu_west, moments, normalized, systematic
+from agents.particle.cloud import Manifold, Moments, liu_west, moments, normalized, systematic
 from coloc_env import noise
 
 Perturb = Literal["liu_west", "fixed"]
+SHRINKAGE = 0.7  # h of Liu–West moves
 RESAMPLE = 0.5  # share of the count below which the effective sample size triggers resampling
 
 # Standard deviations that keep a resampled cloud from collapsing (specs: Liu-West's floor, and the
@@ -35,12 +37,25 @@ class Weighed:
 
 
 class Resampling:
-    """PF-NN paper's Algorithm 2, with counts within ``bounds`` (None: they stay as they are)."""
+    """PF-NN paper's Algorithm 2, with counts within ``bounds`` (None: they stay as they are), whose
+    moves are Liu–West's with h = ``shrinkage`` above a floor of standard deviations ``std``."""
 
-    def __init__(self, process: Process, perturb: Perturb, bounds: tuple[int, int] | None) -> None:
-        self.process, self.bounds = process, bounds
-        self.shrinkage, std = (0.7, FLOOR) if perturb == "liu_west" else (0.0, _FIXED)
-        self.floor = torch.tensor(per_error(process, std), dtype=torch.float64)
+    def __init__(
+        self,
+        space: Manifold,
+        std: Sequence[float],
+        bounds: tuple[int, int] | None,
+        shrinkage: float = SHRINKAGE,
+    ) -> None:
+        self.space, self.bounds, self.shrinkage = space, bounds, shrinkage
+        self.floor = torch.tensor(std, dtype=torch.float64)
+
+    @staticmethod
+    def of(process: Process, perturb: Perturb, bounds: tuple[int, int] | None) -> "Resampling":
+        """Of a motion model's states, moved apart as ``perturb`` says."""
+        if perturb == "liu_west":
+            return Resampling(process, per_error(process, FLOOR), bounds)
+        return Resampling(process, per_error(process, _FIXED), bounds, 0.0)
 
     def weigh(
         self,
@@ -53,7 +68,7 @@ class Resampling:
         ess = (1 / (2 * exact).exp_().sum(-1)).to(log_weights.dtype)
         log_weights = exact.to(log_weights.dtype)
         weights = log_weights.exp()
-        cloud = moments(self.process, particles, weights)
+        cloud = moments(self.space, particles, weights)
         target = count if self.bounds is None else particle_count.adapted(count, ess, self.bounds)
         return Weighed(log_weights, weights, cloud, ess, target)
 
@@ -68,7 +83,7 @@ class Resampling:
         where few are effective, and as many as their count has become."""
         log_weights = weighed.log_weights
         if bool(self.few(weighed, count).any()):
-            size, first = self.process.error_size, self.process.noise_size
+            size, first = self.space.error_size, self.space.noise_size
             draws = normal(key, "pf.step", size, particles.shape[-2], first)
             particles, log_weights = self.resample_few(particles, weighed, count, draws, key)
         particles, log_weights = self.shrink(particles, log_weights, weighed, count)
@@ -134,7 +149,7 @@ class Resampling:
         """Equally weighted particles drawn from the weighted ones, then moved apart."""
         ancestors = systematic(weights, noise.unit(key), count)
         floor = self.floor.to(draws.device)
-        return liu_west(self.process, cloud, ancestors, draws, self.shrinkage, floor)
+        return liu_west(self.space, cloud, ancestors, draws, self.shrinkage, floor)
 
     def gathered(
         self, particles: Float32[Tensor, "B N M S"], weighed: Weighed

@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from agents.particle import particle_count
-from agents.particle.belief import Step, normal
+from agents.particle.belief import normal
 from agents.particle.cloud import effective_sample_size, moments, normalized
 from agents.particle.resampling import RESAMPLE, Resampling
 from coloc_env import noise
@@ -51,11 +51,12 @@ def tempered(
     staged: Bool[Tensor, "B N"],
     evidence: Evidence,
     resampling: Resampling,
-    now: Step,
+    count: Int64[Tensor, "B N"],
+    key: Int64[Tensor, "B N"],
 ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"]]:
     """The evidence in stages for some UAVs, w ← w exp(β gain) with Σβ = 1 and a resampling move
-    between stages; at once for the others. ``gain`` is the evidence about the particles given."""
-    count = now.belief.count
+    between stages, drawn from ``key``; at once for the others. ``gain`` is the evidence about the
+    particles given, ``count`` how many of them live."""
     equal = particle_count.equal_log_weights(particle_count.alive(count, particles.shape[-2]))
     left = torch.ones_like(gain[..., 0])
     for stage in range(_STAGES):
@@ -70,10 +71,10 @@ def tempered(
         if not bool(go_on.any()):
             break
         weights = log_weights.exp()
-        key = noise.fold(now.key, stage)
-        draws = normal(key, "pf.move", resampling.process.error_size, weights.shape[-1])
-        cloud = moments(resampling.process, particles, weights)
-        moved = resampling.resample(cloud, weights, count, draws, key)
+        own = noise.fold(key, stage)
+        draws = normal(own, "pf.move", resampling.space.error_size, weights.shape[-1])
+        cloud = moments(resampling.space, particles, weights)
+        moved = resampling.resample(cloud, weights, count, draws, own)
         particles = torch.where(go_on[..., None, None], moved, particles)
         log_weights = torch.where(go_on.unsqueeze(-1), equal, log_weights)
         gain = evidence(particles, log_weights)

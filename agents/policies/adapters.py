@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
@@ -148,6 +148,10 @@ class LocalizerPolicy(TensorDictModuleBase):
 
     ``record(belief, belief_after, tensordict)`` is called after every step, the action written, and
     gives entries [B, …] for training, which go under ``("train", name)``.
+
+    ``gradients=True``: the localizer's network is a part of the module, and actions, and with them
+    any loss, have gradients by its parameters, through the belief over all steps since it was last
+    detached. Raises ValueError for a localizer without a network.
     """
 
     def __init__(
@@ -156,10 +160,15 @@ class LocalizerPolicy(TensorDictModuleBase):
         scenario: Scenario,
         carry: str = "module",
         record: Record | None = None,
+        gradients: bool = False,
     ) -> None:
         if carry not in CARRIES:
             raise ValueError(f"carry={carry!r} is not allowed: one of {', '.join(CARRIES)}")
+        network = getattr(localizer, "network", None)
+        if gradients and not isinstance(network, nn.Module):
+            raise ValueError(f"gradients=True: {localizer.name} has no network of its own")
         super().__init__()
+        self.network: nn.Module | None = network if gradients else None
         self.localizer = localizer
         self.scenario = scenario
         self.carry = carry
@@ -173,8 +182,11 @@ class LocalizerPolicy(TensorDictModuleBase):
             self.out_keys.append(("next", "belief"))
             self._template = self._sample_belief()
 
-    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self.network is not None):
+            return self._step(tensordict)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         restarts = tensordict.get("is_init", None)
         if restarts is None:
             raise KeyError(

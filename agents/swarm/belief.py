@@ -103,7 +103,7 @@ class Solution:
 
     def residual(self, inputs: StepInput) -> Float64[Tensor, "B N N"]:
         """d̃_ij − ‖p_i − p_j‖ (m), less this step's correction of the delays."""
-        residual = inputs.links.distance - lengths(self.position.detach())
+        residual = inputs.links.distance - lengths(self.position)
         if self.delays is None:
             return residual
         return residual - delays.offsets(self.delays.delay - inputs.delays.delay)

@@ -176,7 +176,7 @@ class EmConfidence(Confidence):
             return torch.where(inputs.links.mask, solution.outlier, prior)
         posterior = calibration.outlier_posterior(
             inputs.error_model,
-            solution.residual(inputs).flatten(1),
+            solution.residual(inputs).detach().flatten(1),
             solution.range_variance(inputs).flatten(1),
             self.std,
             prior.flatten(1),

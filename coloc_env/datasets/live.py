@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from coloc_env.datasets.corrections import corrected, stream_corrections
 from coloc_env.datasets.grid import LINKS, Usual
-from coloc_env.datasets.noise_model import NoiseModel, corrected, stream_corrections
+from coloc_env.datasets.noise_model import NoiseModel
 from coloc_env.datasets.open_format import streams
 from coloc_env.datasets.open_format.columns import Columns, check_numbers
 from coloc_env.datasets.open_format.description import Description

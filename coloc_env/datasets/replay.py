@@ -102,6 +102,7 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
         tuple(low.round(2).tolist()),
         tuple(high.round(2).tolist()),
         origin=recording.origin,
+        start=recording.epoch + grid.start,
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from coloc_env.datasets.open_format.stamps import seconds_text
 from coloc_env.datasets.recording import DataError, Floats, Recording, Track
 from coloc_env.staging import staged_folder
 
@@ -27,9 +28,8 @@ def write_tum(recording: Recording, out: str | os.PathLike[str]) -> None:
         for name, i in zip(names, known, strict=True):
             with (folder / name).open("w", encoding="ascii", newline="\n") as file:
                 for stamp, place, turn in _poses(recording, recording.truth[i]):
-                    sign, (s, ns) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
                     numbers = " ".join(map(repr, (*place, *turn)))
-                    file.write(f"{sign}{s}.{ns:09d} {numbers}\n")
+                    file.write(f"{seconds_text(stamp)} {numbers}\n")
 
 
 def write_bag(recording: Recording, out: str | os.PathLike[str]) -> None:

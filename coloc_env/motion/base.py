@@ -38,7 +38,8 @@ class Arena:
     """What a motion may know of its scenario: the box it flies in (m), team size and step (s).
 
     ``origin``: where the zero of all positions is in the frame that was recorded (m), for files;
-    empty: there is no other frame.
+    empty: there is no other frame. ``start``: the stamp of step 0, ns since 1970 or the recording's
+    zero, for files.
     """
 
     dim: int
@@ -47,6 +48,7 @@ class Arena:
     low: tuple[float, ...]
     high: tuple[float, ...]
     origin: tuple[float, ...] = ()
+    start: int = 0
 
     @property
     def centre(self) -> tuple[float, ...]:

@@ -16,9 +16,10 @@ from coloc_env.datasets.carried import (
     recorded_flow,
     recorded_tdoa,
 )
+from coloc_env.datasets.corrections import corrected
 from coloc_env.datasets.folders import Version, expanded, version
 from coloc_env.datasets.grid import Grid, Usual, aligned, common_grid, usual
-from coloc_env.datasets.noise_model import NoiseModel, corrected, read_noise_model
+from coloc_env.datasets.noise_model import NoiseModel, read_noise_model
 from coloc_env.datasets.open_format import FILE, read_recording
 from coloc_env.datasets.recording import DataError
 from coloc_env.datasets.replay import (

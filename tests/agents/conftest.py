@@ -123,6 +123,8 @@ CHOSEN = {
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
     "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
     "dfgo_central": ("default", "imu_bias", "plane"),
+    "dlspf": ("default", "uniform", "imu_bias", "anchors", "slots", "tags"),
+    "ukf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
@@ -195,7 +197,7 @@ def build(name: str, scenario: Scenario) -> Localizer:
         few["window"] = 3
     if "every" in known:
         few["every"] = 2
-    if "weights" in known:
+    if "weights" in known and not name.startswith("dlspf"):  # untrained, it decodes nothing
         few["weights"] = "none"
     if "main" in known:
         few["main"] = f"pf@particles={PARTICLES}@tempering=true"

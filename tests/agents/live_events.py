@@ -12,8 +12,8 @@ import torch
 
 from agents import make
 from coloc_env import make_scenario
+from coloc_env.datasets.corrections import corrected
 from coloc_env.datasets.grid import aligned, common_grid
-from coloc_env.datasets.noise_model import corrected
 from coloc_env.datasets.open_format import read_recording, write_recording
 from coloc_env.datasets.recording import Recording, Table, Track
 from coloc_env.scenarios.replay import own_beliefs, own_team

@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 CARD = torch.device("cuda:0")
-_BELOW = torch.device("meta")  # what C++ is told: for this device it needs no driver
+_BELOW = torch.device("meta")  # what C++ is given: this device needs no driver
 _READS = ("_local_scalar_dense", "nonzero", "equal", "is_nonzero")  # a number comes back
 _MOVES = ("_to_copy", "copy_")  # take tensors of two devices
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from coloc_env.datasets.noise_model import MotionModel, NoiseModel
 from coloc_env.datasets.recording import Floats, Recording, Table, Track
+from training.calibration.carried import calibrate_carried
 from training.calibration.inertial import calibrate_imu
 from training.calibration.noise import Noise
 from training.calibration.places import refined_anchors, refined_arms
@@ -63,6 +64,8 @@ def calibrate(recording: Recording, *, motion: str = "auto") -> Calibration:
         if height is not None:
             model = replace(model, height=replace(model.height, std=height.white, bias=height.bias))
             noises["height"] = height
+    model, shown = calibrate_carried(recording, model)
+    noises |= shown
     wheels = calibrate_odometry(recording)
     if wheels is not None:
         model = replace(model, odometry=wheels)
@@ -80,6 +83,9 @@ def _without_truth(recording: Recording, motion: str) -> Calibration:
         steady = smoothed(recording, model)
         found = calibrate(replace(steady, tags=np.zeros_like(steady.tags)), motion=motion)
         model = replace(found.model, anchors={}, tags={}, odometry=NoiseModel().odometry)
+        # an estimate without attitudes shows nothing of what is in the body frame
+        own = NoiseModel()
+        model = replace(model, arrival_angles=own.arrival_angles, flow=own.flow)
     assert found is not None
     note = "no truth: calibrated against the team's own smoothed estimate; deviations are too small"
     return replace(found, model=model, notes=(note,))

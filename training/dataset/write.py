@@ -12,13 +12,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agents.localizer import Localizer
+from agents.registry import make
 from coloc_env.json_files import read_json
 from coloc_env.rewards import reward
 from coloc_env.staging import locked, remove_leftovers, staged_file, staged_folder
 from training.dataset.card import card
 from training.dataset.parquet import require_pyarrow, write_steps, write_worlds
 from training.dataset.plan import Plan
-from training.evaluation.evaluate import make
 from training.evaluation.rollout import Breakdown, Step, rollout
 
 CARD, FACTS = "README.md", "dataset.json"

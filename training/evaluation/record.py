@@ -75,7 +75,8 @@ class RunRecord:
     infinity or a numerical error; ``messages`` of such errors, one a run that raised one;
     ``series``: the method's own figures [R, K, N], of which the mean is reported, or the sum over a
     run where the name ends in ``_per_run``; ``ms_per_step`` of the whole team, B = 1, one thread;
-    ``covariance`` [K, N, d, d] (m²) of the positions in the first run (None where it was not kept).
+    ``covariance`` [K, N, d, d] (m²) of the positions in the first run, and ``attitude`` [K, N, a]
+    (None where it was not kept, or is not estimated).
     """
 
     worlds: Worlds
@@ -87,6 +88,7 @@ class RunRecord:
     series: dict[str, Floats] = field(default_factory=dict)
     ms_per_step: float | None = None
     covariance: Floats | None = None
+    attitude: Floats | None = None
 
     def to_arrays(self) -> tuple[Arrays, Facts]:
         """The agent's own arrays, and facts that JSON can hold; the worlds are not among them."""
@@ -143,6 +145,7 @@ class RunRecord:
             },
             parts[0].ms_per_step,
             parts[0].covariance,
+            parts[0].attitude,
         )
 
 
@@ -192,6 +195,7 @@ def _recorded(
     consistency = blank(*shape, value=torch.nan)
     scored, broken = blank(*shape, dtype=torch.bool), blank(shape[0], dtype=torch.bool)
     covariance = blank(*shape[1:], dim, dim, value=torch.nan)
+    turned: list[Tensor] = []
     links = blank(*shape[1:], shape[2], dtype=torch.bool)
     series: dict[str, Tensor] = {}
     for step in rollout(localizer, scenario, seeds, stop=stop, device=device):
@@ -204,6 +208,8 @@ def _recorded(
         broken |= (~step.finite & world.alive).any(-1)
         if step.estimate is not None:
             covariance[k] = step.estimate.covariance[0]
+            now = localizer.attitude(step.belief[:1])
+            turned += [] if now is None else [now[0].double()]
             consistency[:, k] = nees(apart, step.estimate.covariance.double()).to(torch.float32)
             for name, value in _own_figures(localizer, step).items():
                 if name not in series:
@@ -225,6 +231,7 @@ def _recorded(
         broken.cpu().numpy(),
         series={name: values.cpu().numpy() for name, values in series.items()},
         covariance=covariance.cpu().numpy(),
+        attitude=torch.stack(turned).cpu().numpy() if len(turned) == scenario.horizon else None,
     )
 
 

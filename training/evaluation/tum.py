@@ -1,7 +1,8 @@
 """Trajectories as TUM files, which evaluation tools such as evo read.
 
-One line a pose: ``timestamp tx ty tz qx qy qz qw``, in seconds and metres, body to world. In two
-dimensions z is 0 and the heading turns about it; an attitude that is not known is the identity.
+One line a pose: ``timestamp tx ty tz qx qy qz qw``, in seconds (of a recording at the stamps that
+were recorded) and metres, body to world. In two dimensions z is 0 and the heading turns about it;
+an attitude that is not known is the identity.
 """
 
 import re
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from coloc_env.datasets.open_format.stamps import seconds_text
 from training.evaluation.metrics import Floats
 from training.evaluation.results import Evaluation
 
@@ -22,7 +24,9 @@ def write_tum(results: Evaluation, folder: Path) -> None:
     identity = np.broadcast_to((0.0, 0.0, 0.0, 1.0), attitude.shape)
     tracks = {"groundtruth": (truth, attitude)}
     for name, label in zip(results.agents, folder_names(list(results.agents)), strict=True):
-        tracks[label] = (truth + results.agents[name].offset[0], identity)
+        found = results.agents[name]
+        turned = identity if found.attitude is None else quaternions(found.attitude)
+        tracks[label] = (truth + found.offset[0], turned)
     unknown = bool(results.innovations)
     if unknown:
         del tracks["groundtruth"]
@@ -30,16 +34,23 @@ def write_tum(results: Evaluation, folder: Path) -> None:
         (folder / label).mkdir(parents=True)
         for i, uav in enumerate(results.scenario.agents):
             now = results.worlds.scored[0, :, i] | unknown
-            text = tum_text(time[now], position[now, i], turned[now, i])
+            start = results.scenario.arena.start
+            text = tum_text(time[now], position[now, i], turned[now, i], start)
             (folder / label / f"{uav}.txt").write_text(text, encoding="ascii")
 
 
-def tum_text(time: Floats, position: Floats, quaternion: Floats) -> str:
-    """Lines for times [K] s, positions [K, d] m and quaternions [K, 4] xyzw: to the hundredth of a
-    millimetre wherever on Earth."""
+def tum_text(time: Floats, position: Floats, quaternion: Floats, start: int = 0) -> str:
+    """Lines for times [K] s after a stamp (ns; 0: none), positions [K, d] m and quaternions [K, 4]
+    xyzw: to the hundredth of a millimetre wherever on Earth."""
+    stamps = [f"{t:.12g}" for t in time.tolist()]
+    if start:
+        stamps = [seconds_text(start + round(t * 1e9)) for t in time.tolist()]
     flat = np.zeros((len(time), 3 - position.shape[1]))
-    table = np.concatenate((time[:, None], position, flat, quaternion), 1)
-    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in table.tolist())
+    rows = np.concatenate((position, flat, quaternion), 1).tolist()
+    return "".join(
+        " ".join((stamp, *(f"{value:.12g}" for value in row))) + "\n"
+        for stamp, row in zip(stamps, rows, strict=True)
+    )
 
 
 def quaternions(attitude: Floats) -> Floats:

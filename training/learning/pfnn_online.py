@@ -48,17 +48,22 @@ class PerWorld(nn.Module):
 
 
 def learn_online(
-    scenario: Scenario, runs: int, seed: int, progress: Progress, **options: Any
+    scenario: Scenario,
+    runs: int,
+    seed: int,
+    progress: Progress,
+    agent: str = "pfnn",
+    **options: Any,
 ) -> OnlineLearning:
-    """Run ``pfnn`` as the paper does in the worlds of seeds ``seed`` …, which are those of
-    ``coloc evaluate``: random weights at the start (seeded like the world), and every 10 steps one
-    of gradient descent on 50 particles of each UAV in turn.
+    """Run ``agent`` (``pfnn``, with any options) as the paper does in the worlds of seeds ``seed``
+    …, which are those of ``coloc evaluate``: random weights at the start (seeded like the world),
+    and every 10 steps one of gradient descent on 50 particles of each UAV in turn.
 
     ``options`` are ``pfnn``'s own (``correction=(0.2, 1.0)``). All worlds run at once.
     """
 
     def filter_of(world: int) -> Any:
-        return make("pfnn", scenario, weights="none", **({"seed": world} | options))
+        return make(agent, scenario, weights="none", **({"seed": world} | options))
 
     localizer = filter_of(0)
     localizer.corrector = PerWorld([filter_of(seed + b).corrector for b in range(runs)])
@@ -76,7 +81,7 @@ def learn_online(
         errors.append(batch["train", "error"])
         counts.append(batch["train", "count"])
         losses.append(loss.error(samples_of(batch).flatten(1, 2)))
-        progress("pfnn, learning online", EVERY * len(errors), scenario.horizon)
+        progress(f"{agent}, learning online", EVERY * len(errors), scenario.horizon)
 
     trainer = make_trainer(
         EpochCollector(collect, 1),

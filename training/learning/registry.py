@@ -6,6 +6,7 @@ TRAININGS = Registry(
     "training",
     "coloc.trainings",
     {
+        "dlspf": "training.learning.dlspf:dlspf",
         "ippo": "training.learning.mappo:ippo",
         "mappo": "training.learning.mappo:mappo",
         "nnhpff": "training.learning.nnhpff:nnhpff",

@@ -136,9 +136,9 @@ def stdcl_factors(
     variants: str = "/".join(VARIANTS),
     start: str = "none",
     width: Annotated[int, Quantity("", 1, 1 << 10)] = 20,
-    worlds: Worlds = 6,
+    worlds: Worlds = 4,
     epochs: Epochs = 1,
-    steps: Steps = 6,
+    steps: Steps = 12,
     learning_rate: Factor = 3e-3,
     last_rate: Factor = 1e-4,
     seed: Seed = 0,
@@ -153,9 +153,7 @@ def stdcl_factors(
     from ``learning_rate`` to ``last_rate`` along a cosine, batch by batch. ``score_runs``:
     held-out worlds in which ``map`` with and without learned factors is compared at the end.
     """
-    scenarios = [
-        parse_scenario(f"{scenario}:{variant}".rstrip(":")) for variant in variants.split("/")
-    ]
+    scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl_factors", scenarios, steps)
     network = learned(FactorNetwork, start, seed, width=width)
     localizers: list[Any] = [make(_AGENT, one) for one in scenarios]
@@ -204,7 +202,7 @@ class Annealed(RoundRobin):
 def _scale(scenario: Scenario) -> float:
     """RMSE (m) of ``map``, after it has settled."""
     scenario = replace(scenario, horizon=min(scenario.horizon, _SCALE_STEPS))
-    result = record(make(_BASE, scenario), scenario, _SCALE_SEED + torch.arange(4))
+    result = record(make(_BASE, scenario), scenario, _SCALE_SEED + torch.arange(2))
     return metrics.rmse(result.error[:, 5:], result.worlds.scored[:, 5:])
 
 
@@ -215,7 +213,7 @@ def score(
     0 … runs − 1 of some variants."""
     found: dict[str, Any] = {}
     for variant in SCORED if runs else ():
-        one = parse_scenario(f"{scenario}:{variant}".rstrip(":"))
+        one = parse_scenario(scenario, variant)
         localizer: Any = make(_AGENT, one)
         localizer.learn(network)
         each = {}

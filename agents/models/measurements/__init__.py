@@ -10,6 +10,7 @@ from agents.models.measurements.base import (
     Neighbours,
     no_neighbours,
     noise_std,
+    per_state,
     received,
 )
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
@@ -61,6 +62,7 @@ __all__ = [
     "model_of",
     "no_neighbours",
     "noise_std",
+    "per_state",
     "received",
     "usable",
 ]

@@ -48,6 +48,13 @@ def received(believed: Believed, observation: Observation) -> Neighbours:
     )
 
 
+def per_state(observation: Observation, neighbours: Neighbours) -> tuple[Observation, Neighbours]:
+    """The same for every one of a UAV's states [B, N, M, S] that a model is linearized at."""
+    wide = Observation({name: leaf.unsqueeze(2) for name, leaf in observation.leaves.items()})
+    parts = (neighbours.position, neighbours.variance, neighbours.known)
+    return wide, Neighbours(*(part.unsqueeze(2) for part in parts))
+
+
 @dataclass(frozen=True)
 class Block:
     """m measurements of k numbers each, linearized at some state: residual z − h(x).

@@ -81,6 +81,8 @@ class LearnedFactors(Localizer[FactorBelief]):
     next process noise. Without training it is ``map`` itself. Gradients of its parameters reach
     the estimate through the solution, and through covariances and memories those of later steps.
 
+    Raises ValueError for a team with lever arms, anchors or another motion model than an INS's.
+
     ``weights``: a checkpoint's name or path, or ``none``. ``bank=false``: no falling back to
     ``map`` for UAVs whose ranges that predicts better.
     """

@@ -34,6 +34,12 @@ def nanoseconds(texts: Sequence[str], unit: str) -> Stamps:
     return np.array(found, np.int64)
 
 
+def seconds_text(stamp: int) -> str:
+    """A stamp in ns as s, to the last digit."""
+    whole, part = divmod(abs(stamp), 10**9)
+    return f"{'-' * (stamp < 0)}{whole}.{part:09d}"
+
+
 def from_numbers(values: np.ndarray, unit: str) -> Stamps:
     """Stamps that are numbers already (whole, or seconds as a float).
 

@@ -248,6 +248,14 @@ def test_anchors_at_the_ceiling_are_enough(std: float, most: float, tools: Simpl
     assert found.nees.mean() < 4
 
 
+def test_differences_from_a_plane_through_the_room_are_refused() -> None:
+    """Error before: 28 m with four anchors, 0.49 m with eight."""
+    own = {"landmarks": 0, "uwb": False}
+    with pytest.raises(ValueError, match="all 4 anchors lie in one plane"):
+        make("emvf", make_scenario("indoor-v0", tdoa_anchors=4, **own))
+    make("emvf", make_scenario("indoor-v0", tdoa_anchors=8, **own))
+
+
 @pytest.mark.parametrize("name", ["emvf", "hpff"])
 @pytest.mark.parametrize("std", [0.0, 0.1])
 @pytest.mark.parametrize("anchors", [4, 6])

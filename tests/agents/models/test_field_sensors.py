@@ -158,3 +158,45 @@ def test_a_drift_that_is_estimated_beats_one_that_is_considered() -> None:
             seen = world.observation()
         errors.append(float(torch.stack(squared)[20:].mean().sqrt()))
     assert errors[1] < errors[0]
+
+
+EVERYTHING: dict[str, Any] = {
+    "n_uavs": 3,
+    "landmarks": 5,
+    "anchors": 4,
+    "tags": 2,
+    "tag_arm": 0.3,
+    "tdoa_anchors": 4,
+    "angles": True,
+    "gnss": True,
+    "gnss_outage": 0.3,
+    "flow": True,
+    "barometer": True,
+}
+QUICK = (
+    *("ekf", "ekf:fusion=ci", "ekf:fusion=pairwise", "ekf:robust=huber+gate", "ekf_joint"),
+    *("ekf:fusion=ci:second_order=true", "ekf_joint:second_order=true", "emvf", "pf500"),
+)
+SLOW = (
+    *("ekf:fusion=exchange", "ekf_trust", "dfgo", "dfgo_central", "apf", "pfnn", "pf_trust"),
+    *("pf500:proposal=ekf", "pf500:robust=huber", "hpff", "nnhpff"),
+)
+
+
+@pytest.mark.parametrize(
+    "agent", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+)
+def test_everything_at_once_is_served(agent: str) -> None:
+    """By every filter that serves whatever has a model: finite, and near the truth."""
+    scenario = make_scenario("indoor-v0", **EVERYTHING)
+    world, localizer = World(scenario, 2), make(agent, scenario)
+    assert not localizer.ignores(scenario.believed)
+    seen = world.reset(torch.arange(2))
+    belief = localizer.reset(seen)
+    for _ in range(6):
+        belief, estimate = localizer.step(belief, seen)
+        error = estimate.position - world.truth.position
+        world.advance(estimate.action())
+        seen = world.observation()
+    assert bool((torch.linalg.eigvalsh(estimate.covariance.double()) > 0).all())
+    assert float(error.norm(dim=-1).max()) < 2.0

@@ -372,7 +372,7 @@ def at_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         posterior,
         "expected_information",
-        lambda sensors, truth, seen, drawn, pose: whole(sensors, truth, seen, 0 * drawn, pose),
+        lambda sensors, truth, seen, drawn, *rest: whole(sensors, truth, seen, 0 * drawn, *rest),
     )
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coloc_env.datasets.noise_model import corrected, read_noise_model, write_noise_model
+from coloc_env.datasets.corrections import corrected
+from coloc_env.datasets.noise_model import read_noise_model, write_noise_model
 from coloc_env.datasets.open_format import write_recording
 from coloc_env.datasets.recording import IMU_COLUMNS, DataError, Recording, Table, Track
 from coloc_env.datasets.residuals import best_delay, links_of

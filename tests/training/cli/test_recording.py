@@ -63,6 +63,14 @@ def test_refusals_are_one_line(line: tuple[str, ...], words: str, circles: Path)
     assert len(done.output.strip().splitlines()) == 1
 
 
+def test_trajectories_of_a_folder_are_exported(circles: Path, tmp_path: Path) -> None:
+    for kind, made in (("tum", "*.txt"), ("bag", "trajectories/*.mcap"), ("open", "*/truth.csv")):
+        out = tmp_path / kind
+        done = coloc("recording", "export", str(circles), "--format", kind, "--out", str(out))
+        assert done.exit_code == 0, done.output
+        assert list(out.glob(made))
+
+
 def test_a_spreadsheets_folder_is_checked(tmp_path: Path) -> None:
     done = coloc("recording", "check", str(write(tmp_path, spreadsheet())))
     assert done.exit_code == 0, done.output

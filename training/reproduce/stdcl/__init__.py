@@ -5,6 +5,7 @@ from functools import partial
 
 from training.reproduce.stdcl import (
     claims,
+    factors,
     figures,
     goals,
     loop_claims,
@@ -64,8 +65,15 @@ def stdcl(*, n_uavs: int = 200) -> Study:
         loop_figures.CAMPUS,
     )
     real = Part("Recordings", partial(plan.real, n_uavs), tables.real_text, tables=tables.real)
+    better = Part(
+        "Joint biases and factors of ranges",
+        factors.cells,
+        factors.text,
+        goals=factors.goals,
+        tables=factors.table,
+    )
     parts = {
         "paper": own, "stress": stress, "learned": learned, "theory": theory, "campus": campus,
-        "real": real,
+        "real": real, "factors": better,
     }  # fmt: skip
     return Study("stdcl", "ST-DCL", plan.TITLE, 50, parts)

@@ -71,7 +71,8 @@ def couplings_by_turns(one: Runs) -> tuple[Floats, Floats]:
     """[R], [R]: α where velocities change most and where they change least (a tenth of all)."""
     velocity = np.diff(one.truth, axis=1) / one.dt
     turn = np.linalg.norm(np.diff(velocity, axis=1), axis=-1) / one.dt  # at steps 1 … K − 2
-    most, least = [], []
+    most: list[float] = []
+    least: list[float] = []
     for r in range(len(turn)):
         e, s = one.record.offset[r].astype(float), one.scored[r]
         before, after, size = e[1:-1], e[2:], turn[r]
