@@ -83,8 +83,9 @@ class UnscentedFilter(GaussianFilter):
         innovation, apart = self._centred(residuals)  # z − ẑ, and ẑ − h(xᵢ)
         s = self._product(apart, apart) + torch.diag_embed(variances)
         cross = -self._product(self._offsets(prior.covariance), apart)
-        gain = torch.linalg.solve(s, cross.mT).mT  # K = P_xz S⁻¹
-        state = self.process.boxplus(prior.state, (gain @ innovation.unsqueeze(-1))[..., 0])
+        gain = torch.linalg.solve(s, cross.mT).mT.contiguous()  # K = P_xz S⁻¹
+        delta = (gain * innovation.unsqueeze(-2)).sum(-1)
+        state = self.process.boxplus(prior.state, delta)
         covariance = prior.covariance - gain @ s @ gain.mT
         covariance = 0.5 * (covariance + covariance.mT)
         if self.biases:
@@ -120,6 +121,7 @@ class UnscentedFilter(GaussianFilter):
         self, x: Float[Tensor, "B N M k"]
     ) -> tuple[Float[Tensor, "B N k"], Float[Tensor, "B N M k"]]:
         """Mean over sigma points, and what is left of them."""
+        x = x.contiguous()  # in one order of memory, so that rounding is the same in any batch
         mean = (self.mean_weights.to(x.device).unsqueeze(-1) * x).sum(-2, keepdim=True)
         return mean[..., 0, :], x - mean
 

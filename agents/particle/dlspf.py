@@ -11,7 +11,7 @@ from agents.models.measurements import Neighbours, make_measurements, no_neighbo
 from agents.models.process import Process, make_process
 from agents.particle import particle_count, sampling
 from agents.particle.belief import normal, own_keys
-from agents.particle.cloud import moments, select
+from agents.particle.cloud import moments, normalized, select
 from agents.particle.degeneracy import degenerate
 from agents.particle.filter import Particles
 from agents.particle.latent import WINDOW, LatentModel, unaccelerated
@@ -130,10 +130,13 @@ class LatentParticleFilter(Localizer[LatentBelief]):
                     particles, log_weights, gain, few, evidence, self.resampling, count, key
                 )
             else:
-                log_weights = log_weights + gain
+                log_weights = normalized(log_weights + gain)
         weighed = self.resampling.weigh(particles, log_weights, count)
-        cloud = moments(self.process, self._states(reference, particles), weighed.weights)
-        window = self._mean_window(particles, weighed.weights)
+        windows = self._windows(particles)
+        states = self._beside(reference, windows[..., -1, :], particles)
+        cloud = moments(self.process, states, weighed.weights)
+        scaled = weighed.weights.double()[..., None, None] * windows  # float64, as in ``moments``
+        window = scaled.sum(-3, keepdim=True).to(windows.dtype)  # Σ w D(z)
         particles, log_weights = self.resampling.next_particles(particles, weighed, count, key)
         after = build(
             LatentBelief,
@@ -214,6 +217,15 @@ class LatentParticleFilter(Localizer[LatentBelief]):
     ) -> Float32[Tensor, "B N M S"]:
         """x = x̄ ⊞ [D(z), rest]."""
         newest = self.model.newest(particles[..., : self.space.latents])
+        return self._beside(reference, newest, particles)
+
+    def _beside(
+        self,
+        reference: Float32[Tensor, "B N S"],
+        newest: Float32[Tensor, "B N M 6"],
+        particles: Float32[Tensor, "B N M L"],
+    ) -> Float32[Tensor, "B N M S"]:
+        """The same, decoded already."""
         rest = particles[..., self.space.latents :]
         delta = concat((newest[..., :3], newest[..., 3:] / self.length, rest))
         at = reference.unsqueeze(-2).expand(*particles.shape[:-1], -1)
@@ -222,24 +234,20 @@ class LatentParticleFilter(Localizer[LatentBelief]):
     def _about(
         self,
         mean: Float32[Tensor, "B N S"],
-        window: Float32[Tensor, "B N W 6"],
+        window: Float32[Tensor, "B N 1 W 6"],
         reference: Float32[Tensor, "B N S"],
         particles: Float32[Tensor, "B N M L"],
     ) -> Float32[Tensor, "B N M L"]:
         """Particles beside the mean, the new reference: windows less the mean, encoded again."""
-        windows = self.model.decode(particles[..., : self.space.latents])
-        states = self._states(reference, particles)
+        windows = self._windows(particles)
+        states = self._beside(reference, windows[..., -1, :], particles)
         error = self.process.boxminus(states, mean.unsqueeze(-2).expand_as(states))
-        z = self.model.encode(windows - window.unsqueeze(-3))
+        z = self.model.encode(windows - window)
         return torch.cat((z, error[..., 6:]), -1)
 
-    def _mean_window(
-        self, particles: Float32[Tensor, "B N M L"], weights: Float32[Tensor, "B N M"]
-    ) -> Float32[Tensor, "B N W 6"]:
-        """Σ w D(z)."""
-        windows = self.model.decode(particles[..., : self.space.latents])
-        mean = weights.unsqueeze(-2) @ windows.flatten(-2)
-        return mean.unflatten(-1, windows.shape[-2:]).squeeze(-3)
+    def _windows(self, particles: Float32[Tensor, "B N M L"]) -> Float32[Tensor, "B N M W 6"]:
+        decoded: Tensor = self.model.decode(particles[..., : self.space.latents])
+        return decoded
 
     # ---------------------------------------------------------------- prediction and update
 

@@ -187,7 +187,7 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     if lost:
         found.append((1, f"nothing shows where {', '.join(lost)} is: no anchor, landmark or fix"))
     anchors = recording.anchors
-    if "anchor_ranges" in recording.streams and len(anchors):
+    if {"anchor_ranges", "tdoa"} & recording.streams.keys() and len(anchors):
         extent = np.linalg.svd(anchors - anchors.mean(0), compute_uv=False)
         if len(anchors) < recording.dim + 1 or extent[-1] < 0.05 * max(extent[0], 1e-9):
             where = "in one line" if recording.dim == 2 else "in one plane"

@@ -134,7 +134,7 @@ CHOSEN = {
     "dwmds": ("ranges", "anchors", "many", "tags"),
     "vmds": ("ranges", "anchors"),
     **dict.fromkeys(("fcmds", "gn"), ("anchors", "many", "tags")),
-    "stdcl": ("swarm", "campus"),
+    **dict.fromkeys(("stdcl", "stdcl_factors"), ("swarm", "campus")),
     "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
@@ -210,7 +210,7 @@ def room(name: str, **overrides: Any) -> Scenario:
     chosen = CHOSEN.get(name, ("default",))
     if "stein2d" in chosen:
         return make_scenario("stein2d-v0", **overrides)
-    if name in ("stdcl", "stgat"):
+    if name in ("stdcl", "stdcl_factors", "stgat"):
         return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
     if "sight" in chosen:
         return make_scenario("indoor-v0", uwb=False, **overrides)

@@ -238,7 +238,8 @@ def _recorded(
 def places_of(world: World) -> dict[str, Floats]:
     """Positions [M, d] of landmarks and anchors in the first world, m."""
     dim, static = world.scenario.arena.dim, world.static
-    maps = {"landmarks": "landmark_map", "anchors": "anchor_map"}
+    anchors = "anchor_map" if "anchor_map" in static else "tdoa_map"
+    maps = {"landmarks": "landmark_map", "anchors": anchors}
     return {
         name: static[leaf][0, 0].reshape(-1, dim).cpu().numpy()
         for name, leaf in maps.items()

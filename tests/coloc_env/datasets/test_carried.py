@@ -12,6 +12,7 @@ import yaml
 from agents import make
 from agents.online import OnlineLocalizer
 from coloc_env.datasets import DataError, Recording
+from coloc_env.datasets.check import check
 from coloc_env.datasets.open_format import read_recording
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import ArrivalAngles, Height, OpticalFlow, PositionFix, Tdoa
@@ -92,6 +93,19 @@ def test_what_is_of_space_is_refused_in_the_plane(name: str, tmp_path: Path) -> 
     }
     with pytest.raises(DataError, match="for 3 dimensions"):
         read(tmp_path, files)
+
+
+def test_a_mirror_image_is_warned_of_and_no_robot_is_lost(tmp_path: Path) -> None:
+    """Three anchors in space; b hears them, a only knows in which direction he is."""
+    files = swarm()
+    del files["a/tdoa.csv"]
+    words = check(read(tmp_path / "one", files)).warnings
+    assert any("a mirror image fits as well" in text for text in words)
+    assert not any("nothing shows where" in text for text in words)
+    for name in "ab":
+        del files[f"{name}/angles.csv"]
+    words = check(read(tmp_path / "two", files)).warnings
+    assert any("nothing shows where a is" in text for text in words)
 
 
 # ---------------------------------------------------------------- a recording of a simulated team

@@ -61,14 +61,23 @@ def coupling(errors: Floats, scored: Any) -> float:
     return float((before * after * both).sum() / (before**2 * both).sum())
 
 
+def settles(one: Runs) -> bool:
+    """Whether runs are long enough for errors to be compared from step to step."""
+    return one.steps > 2 * _SETTLED
+
+
 def couplings(one: Runs) -> Floats:
-    """[R]: α of each run, after it has settled."""
+    """[R]: α of each run, after it has settled; NaN for runs that are too short."""
+    if not settles(one):
+        return np.full(len(one.error), np.nan)
     kept = zip(one.record.offset[:, _SETTLED:], one.scored[:, _SETTLED:], strict=True)
     return np.array([coupling(e.astype(float), s) for e, s in kept])
 
 
 def couplings_by_turns(one: Runs) -> tuple[Floats, Floats]:
     """[R], [R]: α where velocities change most and where they change least (a tenth of all)."""
+    if not settles(one):
+        return couplings(one), couplings(one)
     velocity = np.diff(one.truth, axis=1) / one.dt
     turn = np.linalg.norm(np.diff(velocity, axis=1), axis=-1) / one.dt  # at steps 1 … K − 2
     most: list[float] = []
@@ -99,7 +108,9 @@ def bounded(one: Runs) -> tuple[Floats, Floats]:
 
 
 def looseness(one: Runs) -> Floats:
-    """[R]: theorem 1's bound over the RMS error in the last step."""
+    """[R]: theorem 1's bound over the RMS error in the last step; NaN as in ``couplings``."""
+    if not settles(one):
+        return couplings(one)
     rms, bound = bounded(one)
     return bound[:, -1] / rms[:, -1]
 
