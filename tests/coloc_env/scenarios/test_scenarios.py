@@ -33,7 +33,7 @@ from coloc_env.world import World
         ({"room": (1e308, 20.0, 5.0)}, "room=.* is not allowed: 3 numbers > 0 in m"),
         (
             {"uwb_std": float("inf")},
-            "uwb_std=inf is not allowed: a number ≥ 0 in m, at most 1e+12, is needed",
+            "uwb_std=inf is not allowed: a number ≥ 0 in m, at most 1e.12, is needed",
         ),
         ({"max_speed": 0.0}, "max_speed=0.0 is not allowed: a number > 0 in m/s or none"),
         ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),

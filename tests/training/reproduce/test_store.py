@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from agents.localizer import Localizer
+from agents.parts import parts_of
 from agents.registry import make
 from coloc_env.scenarios import make_scenario
 from training import identity
@@ -200,7 +201,7 @@ def test_a_piece_depends_on_its_family_and_its_localizers(
     piece = Piece(Variant("x", "x", overrides, scenario, steps=3), (agent,), 0, 1)
     work._settings.cache_clear()
     before = piece.settings()["code"]
-    changed, read = Path(identity.__file__).parents[2] / file, Path.read_text
+    changed, read = Path(identity.__file__).parents[1] / file, Path.read_text
 
     def with_change(path: Path, encoding: str | None = None) -> str:
         return read(path, encoding) + ("\nCHANGED = 1\n" if path == changed else "")
@@ -244,7 +245,7 @@ def test_weights_of_learned_agents(agent: str) -> None:
     one = make(agent, scenario, weights="none")
     before = identity.weights_of(one)
     assert before is not None
-    networks = [part for part in identity._parts(one, set()) if isinstance(part, nn.Module)]
+    networks = [part for part in parts_of(one) if isinstance(part, nn.Module)]
     with torch.no_grad():
         next(networks[0].parameters()).add_(1.0)
     assert identity.weights_of(one) != before
