@@ -28,11 +28,11 @@ from training.bench.cases import Case, Timed, cases
 from training.bench.figures import FIGURES, draw
 from training.bench.growth import growth
 from training.bench.growth_figures import device_figure, growth_figure
+from training.bench.growth_tables import growth_table, study_cost
 from training.bench.learning import learning_cases
 from training.bench.on_device import on_device
 from training.bench.peers import peers
-from training.bench.spread import spread
-from training.bench.study_cost import study_cost
+from training.bench.spread import spread, spread_table
 from training.pool import Workers
 
 T = TypeVar("T")
@@ -72,13 +72,14 @@ def bench(out: Path, quick: bool = False, agents: bool = True) -> None:
 
 
 def bench_growth(out: Path, quick: bool, device: torch.device) -> None:
-    """Write ``growth.json``, its figure, and ``study_cost.json``, the table of a study's cost."""
-    names = ("growth.json", "growth.png", "study_cost.json")
+    """Write ``growth.json``, its figure and its table, and a table of what a study costs."""
+    names = ("growth.json", "growth.png", "growth_table.json", "study_cost.json")
     with staged_folder(out, names) as folder:
         results = growth(quick, device, _track)
         _write(results, folder / names[0])
         growth_figure(results).savefig(folder / names[1], dpi=110)
-        _write(study_cost(results), folder / names[2])
+        _write(growth_table(results), folder / names[2])
+        _write(study_cost(results), folder / names[3])
     Console().print(f"written to {out}", highlight=False)
 
 
@@ -92,10 +93,12 @@ def bench_device(out: Path, quick: bool, device: torch.device) -> None:
 
 
 def bench_spread(out: Path, quick: bool, workers: Workers) -> None:
-    """Write ``spread.json``."""
-    with staged_folder(out, ("spread.json",)) as folder, _one_thread():
+    """Write ``spread.json``, and its table."""
+    names = ("spread.json", "spread_table.json")
+    with staged_folder(out, names) as folder, _one_thread():
         results = spread(quick, workers)
-        _write(results, folder / "spread.json")
+        _write(results, folder / names[0])
+        _write(spread_table([results]), folder / names[1])
     shown = ("start_s", "ms_per_cell", "alone_s", "spread_s", "speed_up")
     lines = [(name, f"{results[name]:.3g}") for name in shown]
     Console().print(_table(("", "measured"), lines), highlight=False)

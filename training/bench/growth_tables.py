@@ -1,7 +1,8 @@
-"""What a study costs, from what steps cost: time and memory on machines of several sizes."""
+"""Tables of growth, and of what a study costs on machines of several sizes, from unit costs."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from coloc_env.scenarios import make_scenario
@@ -12,6 +13,41 @@ MACHINES = {
     "workstation, 32 cores": 32,
     "cluster, 10 nodes of 64 cores": 640,
 }
+
+
+_AGAINST = {"n_uavs": "UAVs"}
+
+
+def growth_table(growth: dict[str, Any]) -> dict[str, Any]:
+    """The table of all sweeps, as ``docs/results/measured`` has tables: ends, and the slope of
+    log time against log size between the two largest sizes."""
+    rows = []
+    for one in growth["sweeps"]:
+        sizes, ms, held = one["size"], one["ms"], one["bytes"]
+        if len(sizes) < 2:
+            continue
+        slope = math.log(ms[-1] / ms[-2]) / math.log(sizes[-1] / sizes[-2])
+        rows.append(
+            [
+                f"`{one['name']}`" if one["agent"] else "worlds alone",
+                f"`{one['scenario']}`",
+                _AGAINST.get(one["key"], one["key"]),
+                f"{sizes[0]:,} … {sizes[-1]:,}",
+                f"{ms[0]:.2g} … {ms[-1]:.3g}",
+                f"{slope:.1f}",
+                f"{held[0] / 1e6:.2g} … {held[-1] / 1e6:.3g}",
+            ]
+        )
+    return {
+        "title": "Time and memory of a step",
+        "caption": "Worlds and agent together. Slope: of log time against log size, between the "
+        "two largest sizes.",
+        "command": "coloc bench --growth",
+        "provenance": source_of(growth),
+        "header": ["agent", "scenario", "against", "sizes", "ms a step", "slope", "MB"],
+        "align": ["left", "left", "left", "right", "right", "right", "right"],
+        "rows": rows,
+    }
 
 
 def study_cost(growth: dict[str, Any]) -> dict[str, Any]:
