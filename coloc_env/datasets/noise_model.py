@@ -93,24 +93,26 @@ class ImuModel:
 
 
 @dataclass(frozen=True)
-class ScalarModel:
-    """A measured number or vector: ``std`` and, taken off, ``bias``, in its own unit."""
+class VectorModel:
+    """Vectors to landmarks: ``std`` m of each axis."""
 
     std: float = 0.2
-    bias: float = 0.0
 
 
 @dataclass(frozen=True)
-class HeightModel(ScalarModel):
-    """Heights; of a barometer a ``drift``, too: the standard deviation (m) of a bias that filters
-    estimate, whose correlation falls by e in ``drift_time`` s (0: none)."""
+class HeightModel:
+    """Heights: ``std`` m, and a ``bias`` m that is taken off; of a barometer a ``drift``, too: the
+    standard deviation (m) of a bias that filters estimate, whose correlation falls by e in
+    ``drift_time`` s (0: none)."""
 
+    std: float = 0.2
+    bias: float = 0.0
     drift: float = 0.0
     drift_time: float = 300.0
 
 
 @dataclass(frozen=True)
-class FixModel(ScalarModel):
+class FixModel:
     """Position fixes: ``std`` m of each axis, or of the horizontal ones where there is a
     ``vertical_std`` m (0: none)."""
 
@@ -164,7 +166,7 @@ class NoiseModel:
     uav_ranges: RangeModel = RangeModel()
     landmark_bearings: BearingModel = BearingModel()
     uav_bearings: BearingModel = BearingModel()
-    landmark_vectors: ScalarModel = ScalarModel()
+    landmark_vectors: VectorModel = VectorModel()
     tdoa: TdoaModel = TdoaModel()
     arrival_angles: AngleModel = AngleModel()
     flow: FlowModel = FlowModel()

@@ -92,6 +92,13 @@ def test_what_is_believed_is_used(folder: Path) -> None:
     assert better < 0.1
 
 
+@pytest.mark.parametrize("text", ["position_fix: {bias: 1.0}", "landmark_vectors: {bias: 1.0}"])
+def test_a_belief_that_would_be_ignored_is_refused(text: str, folder: Path) -> None:
+    (folder / "believed.yaml").write_text(text + "\n")
+    with pytest.raises(ValueError, match="bias"):
+        rmse(folder / "circles", believed=str(folder / "believed.yaml"))
+
+
 def test_a_recordings_own_belief_is_the_default(folder: Path) -> None:
     given = rmse(folder / "circles", believed=str(folder / "believed.yaml"))
     own = folder / "circles" / "recording.yaml"
