@@ -114,7 +114,14 @@ def test_antennas_stay_and_clocks_wander() -> None:
     torch.testing.assert_close(once.common, twice.common)
 
 
-@pytest.mark.parametrize("overrides", [{}, {"clock_skew": 0.0}, {"clock_offset": 0.0}])
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {},
+        pytest.param({"clock_skew": 0.0}, marks=pytest.mark.slow),
+        pytest.param({"clock_offset": 0.0}, marks=pytest.mark.slow),
+    ],
+)
 def test_it_pays_where_clocks_are_off(overrides: dict[str, float], tools: SimpleNamespace) -> None:
     scenario = make_scenario("campus-v0", flight="s1", horizon=400, **overrides)
     errors = [

@@ -16,6 +16,7 @@ from training.bench.bench import NAMES, bench
 from training.bench.parts import PROFILED, REST, Stopwatch, _watching, missing_parts, step_parts
 
 
+@pytest.mark.slow
 def test_a_quick_benchmark_writes_numbers_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
