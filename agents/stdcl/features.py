@@ -212,6 +212,15 @@ def _scalars(
     return torch.cat((own, everywhere.unsqueeze(1).expand(-1, own.shape[1], -1), age), -1)
 
 
+def link_gain(
+    seen: Float64[Tensor, "B N N"], mask: Bool[Tensor, "B N N"]
+) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+    """How many steps the running mean of each link holds after one, and what that counts in it:
+    arithmetic at first, then exponential; the mean of a link without ranges loses its weight."""
+    seen = torch.where(mask, seen + 1, seen * (1 - 1 / _LINK_TIME))
+    return seen, (1 / seen.clamp_min(1.0)).clamp_min(1 / _LINK_TIME) * mask
+
+
 def _updated(
     means: RunningMeans,
     residual: Float64[Tensor, "B N N"],
@@ -220,8 +229,7 @@ def _updated(
 ) -> RunningMeans:
     """The running means after a step: arithmetic at first, then exponential; the mean of a link
     without ranges loses its weight."""
-    seen = torch.where(mask, means.seen + 1, means.seen * (1 - 1 / _LINK_TIME))
-    gain = (1 / seen.clamp_min(1.0)).clamp_min(1 / _LINK_TIME) * mask
+    seen, gain = link_gain(means.seen, mask)
     steps = means.steps + 1
     times = innovation.new_tensor(_TIMES)
     share = torch.maximum(1 / steps[..., None, None], 1 / times)

@@ -1,6 +1,5 @@
 """Training of ST-DCL's graph network in the loop that it closes (paper, section 4.2.5)."""
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
@@ -13,12 +12,11 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.policies.adapters import LocalizerPolicy, flat, restored
+from agents.policies.adapters import LocalizerPolicy
 from agents.stdcl.loop import NetworkLoop
 from agents.stdcl.network import StGnn
 from agents.weights import learned
 from coloc_env.envs.torchrl import CoLocEnv
-from coloc_env.observation import Observation, all_leaves
 from coloc_env.options import Factor, Quantity, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
@@ -38,6 +36,14 @@ from training.learning.collectors import (
     world_seed,
 )
 from training.learning.run import Progress, Training, make_trainer
+from training.learning.through_time import (
+    FAR,
+    cosine,
+    far_off,
+    masked_mean,
+    run_again,
+    with_belief,
+)
 
 # 60 to 150 UAVs; a radius of 15 km gives 60 of them the degree that 200 have at 5 km. Weaves and
 # the layouts u and o are never met in training: they are for the final test.
@@ -64,7 +70,6 @@ VARIANTS = (
 )
 SCORED = ("", "ins_bias=0", "nlos=0.5", "comm_radius=2500", "motion=weave:v_max=100", "layout=u")
 METHODS, BASE = ("stdcl", "stgat"), "dwmds_st"
-_FAR = 3.0  # times the optimizer's RMSE, beyond which the loss grows linearly
 _LIKELIHOOD = 0.05  # of the covariance's likelihood in the loss
 _SMOOTH = 0.1  # of the trajectory's second difference, in the second stage
 _SCALE_SEED = 1 << 36
@@ -96,21 +101,13 @@ class StDclLoss(LossModule):
         self.smooth = 0.0  # weight of the second difference
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        train = tensordict["train"]
-        variant = int(train["variant"][0, 0])
+        variant = int(tensordict["train", "variant"][0, 0])
         loop, scenario, scale = self.loops[variant], self.scenarios[variant], self.scales[variant]
         n, d, free = scenario.arena.n_uavs, scenario.arena.dim, slice(scenario.anchor_uavs, None)
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
         observed = tensordict["uav", "observation"]
-        leaves = tuple(all_leaves(scenario))
-        belief: Any = None
         positions, variances = [], []
-        for t in range(tensordict.shape[1]):
-            observation = Observation({name: observed[name][:, t] for name in leaves})
-            if belief is None:
-                begin = train.exclude("variant")[:, 0]
-                belief = restored(loop.reset(observation), begin, observation.batch_size)
-            belief, estimate = loop.step(belief, observation)
+        for estimate in run_again(loop, scenario, tensordict):
             positions.append(estimate.position[:, free])
             variances.append(estimate.covariance[:, free, 0, 0])
         found = torch.stack(positions, 1)
@@ -120,33 +117,19 @@ class StDclLoss(LossModule):
         likelihood = negative_log_likelihood(error, torch.stack(variances, 1), scale)
         return TensorDict(
             {
-                "loss_position": _mean(far_off(error.square().sum(-1), scale), scored),
-                "loss_spread": _LIKELIHOOD * _mean(likelihood, scored),
-                "loss_smooth": self.smooth * _mean(bent, scored[:, 2:] & scored[:, :-2]),
+                "loss_position": masked_mean(far_off(error.square().sum(-1), scale), scored),
+                "loss_spread": _LIKELIHOOD * masked_mean(likelihood, scored),
+                "loss_smooth": self.smooth * masked_mean(bent, scored[:, 2:] & scored[:, :-2]),
             }
         )
-
-
-def far_off(squared: Float[Tensor, "*s"], scale: float) -> Float[Tensor, "*s"]:
-    """Squared errors (m²) in units of ``scale``², growing linearly with the error far off."""
-    return 2 * _FAR**2 * ((1 + squared / (_FAR * scale) ** 2).sqrt() - 1)
 
 
 def negative_log_likelihood(
     error: Float[Tensor, "*s d"], variance: Float[Tensor, "*s"], scale: float
 ) -> Float[Tensor, "*s"]:
     """½ (e²/P + d log P) of an isotropic variance (m²), of errors up to some times ``scale``."""
-    squared = error.square().sum(-1).clamp_max(2 * (_FAR * scale) ** 2)
+    squared = error.square().sum(-1).clamp_max(2 * (FAR * scale) ** 2)
     return 0.5 * (squared / variance + error.shape[-1] * variance.log())
-
-
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
-
-
-def _recorded(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Any]:
-    """The belief that a step starts from, and which scenario it is of."""
-    return {**flat(before), "variant": torch.full(before.batch_size[:1], variant)}
 
 
 def stdcl(
@@ -194,9 +177,8 @@ def stdcl(
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
     def collect(epoch: int) -> RoundRobin:
-        share = 0.5 * (1 + math.cos(math.pi * epoch / max(1, epochs - 1)))
         for group in optimizer.param_groups:
-            group["lr"] = last_rate + (learning_rate - last_rate) * share
+            group["lr"] = cosine(learning_rate, last_rate, epoch / max(1, epochs - 1))
         loss.smooth = _SMOOTH if epoch >= smooth_from * epochs else 0.0
         first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
@@ -204,7 +186,7 @@ def stdcl(
             env: Any = CoLocEnv(one, worlds, seed=first + i * worlds)
             if augment:
                 env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i))
-            policy = LocalizerPolicy(loop, one, record=partial(_recorded, i))
+            policy = LocalizerPolicy(loop, one, record=partial(with_belief, i))
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         return RoundRobin(collectors)
 

@@ -1,24 +1,20 @@
 """Training of learned factors through the solution in which they stand."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.policies.adapters import LocalizerPolicy, flat, restored
+from agents.policies.adapters import LocalizerPolicy
 from agents.stdcl.factors.localizer import LearnedFactors
 from agents.stdcl.factors.network import FactorNetwork
 from agents.weights import learned
 from coloc_env.envs.torchrl import CoLocEnv
-from coloc_env.observation import Observation, all_leaves
 from coloc_env.options import Factor, Quantity
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
@@ -37,6 +33,7 @@ from training.learning.collectors import (
     world_seed,
 )
 from training.learning.run import Progress, Training, make_trainer
+from training.learning.through_time import cosine, far_off, masked_mean, run_again, with_belief
 from training.learning.trust import negative_log_likelihood
 
 # Thirty UAVs in the density of swarm-v0's 200: from three neighbours each to dense networks.
@@ -57,7 +54,6 @@ VARIANTS = (
 )
 SCORED = ("comm_radius=1500:nlos=0.3:nlos_time=10", "comm_radius=2500:nlos=0.5", "")
 _AGENT, _BASE = "stdcl_factors:weights=none:bank=false", "map"
-_FAR = 3.0  # times map's RMSE, beyond which the loss grows linearly
 _LIKELIHOOD = 0.1  # of the covariance's likelihood in the loss
 _SCALE_SEED, _SCALE_STEPS = 1 << 36, 60
 
@@ -87,21 +83,12 @@ class FactorLoss(LossModule):
         self.scales = tuple(scales)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        train = tensordict["train"]
-        variant = int(train["variant"][0, 0])
+        variant = int(tensordict["train", "variant"][0, 0])
         localizer, scenario = self.localizers[variant], self.scenarios[variant]
         n, d, free = scenario.arena.n_uavs, scenario.arena.dim, slice(scenario.anchor_uavs, None)
         state = tensordict["state"].unflatten(-1, (n, -1)).double()
-        observed = tensordict["uav", "observation"]
-        leaves = tuple(all_leaves(scenario))
-        belief: Any = None
         positions, covariances = [], []
-        for t in range(tensordict.shape[1]):
-            observation = Observation({name: observed[name][:, t] for name in leaves})
-            if belief is None:
-                begin = train.exclude("variant")[:, 0]
-                belief = restored(localizer.reset(observation), begin, observation.batch_size)
-            belief, estimate = localizer.step(belief, observation)
+        for estimate in run_again(localizer, scenario, tensordict):
             positions.append(estimate.position[:, free])
             covariances.append(estimate.covariance[:, free])
         error = torch.stack(positions, 1) - state[:, :, free, :d]
@@ -110,24 +97,10 @@ class FactorLoss(LossModule):
         likelihood = negative_log_likelihood(error, torch.stack(covariances, 1))
         return TensorDict(
             {
-                "loss_position": _mean(pseudo_huber(squared), scored),
-                "loss_likelihood": _LIKELIHOOD * _mean(likelihood, scored),
+                "loss_position": masked_mean(far_off(squared), scored),
+                "loss_likelihood": _LIKELIHOOD * masked_mean(likelihood, scored),
             }
         )
-
-
-def pseudo_huber(squared: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
-    """Squares that grow linearly with the error from _FAR on."""
-    return 2 * _FAR**2 * ((1 + squared / _FAR**2).sqrt() - 1)
-
-
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
-
-
-def _recorded(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Any]:
-    """The belief that a step starts from, and which variant it is of."""
-    return {**flat(before), "variant": torch.full(before.batch_size[:1], variant)}
 
 
 def stdcl_factors(
@@ -164,15 +137,14 @@ def stdcl_factors(
 
     def anneal(share: float) -> None:
         for group in optimizer.param_groups:
-            cosine = 0.5 * (1 + math.cos(math.pi * share))
-            group["lr"] = last_rate + (learning_rate - last_rate) * cosine
+            group["lr"] = cosine(learning_rate, last_rate, share)
 
     def collect(epoch: int) -> Annealed:
         first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
         for i, (localizer, one) in enumerate(zip(localizers, scenarios, strict=True)):
             env = CoLocEnv(one, worlds, seed=first + i * worlds)
-            policy = LocalizerPolicy(localizer, one, record=partial(_recorded, i))
+            policy = LocalizerPolicy(localizer, one, record=partial(with_belief, i))
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         batches = sum(one.horizon // steps for one in scenarios)
         return Annealed(collectors, lambda k: anneal((epoch + k / batches) / epochs))

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, noise_std
+from agents.models.measurements.base import Block, Measurement, Neighbours, body_frame, noise_std
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix, wrap_angle
 from coloc_env.observation import Observation
@@ -39,9 +39,7 @@ class UavAngles(Measurement):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        rotation, turn = process.rotation(x), process.attitude_error
-        if rotation is None or turn is None:
-            raise ValueError("angles are in the body frame: the motion model has no attitude")
+        rotation, turn = body_frame(process, x, "angles are")
         z, mask = self.read(observation)
         points = torch.cat([neighbours.position] * self.depth, -2).to(x.dtype)
         theirs = torch.cat([neighbours.variance] * self.depth, -2)

@@ -101,6 +101,17 @@ class Block:
         return replace(self, variance=self.variance + steps * (lateral / (2 * self.distance)) ** 2)
 
 
+def body_frame(
+    process: Process, x: Float[Tensor, "B N S"], what: str
+) -> tuple[Float[Tensor, "B N d d"], slice]:
+    """The attitude R (body to world) of states, and where its error stands. ValueError where
+    ``what`` is measured in the body frame (a noun with its verb), and no attitude is a state."""
+    rotation, turn = process.rotation(x), process.attitude_error
+    if rotation is None or turn is None:
+        raise ValueError(f"{what} in the body frame: the motion model has no attitude")
+    return rotation, turn
+
+
 def believed_biases(*std: float) -> tuple[float, ...]:
     """Standard deviations of the biases of a link's numbers; none where all are 0."""
     return std if any(std) else ()

@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.models.measurements.base import Block, Measurement, Neighbours, noise_std
+from agents.models.measurements.base import Block, Measurement, Neighbours, body_frame, noise_std
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
@@ -27,9 +27,7 @@ class BodyVelocities(Measurement):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        rotation, turn = process.rotation(x), process.attitude_error
-        if rotation is None or turn is None:
-            raise ValueError("flow is in the body frame: the motion model has no attitude")
+        rotation, turn = body_frame(process, x, "flow is")
         z, mask = usable(observation["flow"].unsqueeze(-2), observation[self.mask_leaf] > 0)
         velocity = (rotation.mT @ x[..., 3:6].unsqueeze(-1))[..., 0]  # Rᵀ v
         residual = z.to(x.dtype) - velocity[..., None, :2]

@@ -13,6 +13,7 @@ from agents.models.measurements.base import (
     Measurement,
     Neighbours,
     believed_biases,
+    body_frame,
     noise_std,
 )
 from agents.models.process import Process
@@ -46,11 +47,7 @@ class LandmarkVectors(Measurement):
         derivatives: bool = True,
     ) -> Block:
         d = process.dim
-        rotation, turn = process.rotation(x), process.attitude_error
-        if rotation is None or turn is None:
-            raise ValueError(
-                "landmark vectors are in the body frame: the motion model has no attitude"
-            )
+        rotation, turn = body_frame(process, x, "landmark vectors are")
         z, mask = self.read(observation, d)
         apart = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)) - x[..., None, :d]
         expected = apart @ rotation

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.stdcl.features import link_gain
 from agents.swarm.belief import StepInput
 from agents.swarm.expectation_propagation import Cavity, Sites
 from agents.swarm.links import lengths
@@ -26,7 +27,6 @@ NODES = (
 )
 SPEED, CONFIDENCE = LINKS.index("relative_speed"), LINKS.index("confidence")
 _CLIP = 5.0  # standard deviations
-_TIME = 8.0  # steps over which a link is averaged
 _TINY = 1e-3  # of probabilities, and of variances in those of a range
 
 
@@ -137,8 +137,7 @@ def _updated(
     outlier: Float64[Tensor, "B N N"],
 ) -> LinkMeans:
     """Arithmetic means at first, then exponential; that of a link without ranges loses weight."""
-    seen = torch.where(mask, means.seen + 1, means.seen * (1 - 1 / _TIME))
-    gain = (1 / seen.clamp_min(1.0)).clamp_min(1 / _TIME) * mask.double()
+    seen, gain = link_gain(means.seen, mask)
     new = {"residual": z, "magnitude": z.abs(), "outlier": outlier}
     parts = {
         name: getattr(means, name) + gain * (value - getattr(means, name))

@@ -10,16 +10,10 @@ from torch import Tensor
 from agents import make
 from agents.bank import Trial
 from coloc_env.observation import Observation
-from coloc_env.scenario import Scenario
-from coloc_env.scenarios import make_scenario
-from coloc_env.world import World
+from tests.agents.particle.test_hybrid import errors, wsn
 
 ALWAYS = "hpff:quantile=1e-12"  # alarms at every step
 MAIN = "pf@particles=200"
-
-
-def wsn(**overrides: Any) -> Scenario:
-    return make_scenario("wsn-v0", **{"n_uavs": 2} | overrides)
 
 
 def series(localizer: Any, run: Any, name: str) -> Tensor:
@@ -60,19 +54,6 @@ def test_a_restart_that_predicts_better_takes_the_place(tools: SimpleNamespace) 
         said.append(estimate.position)
     apart = (torch.stack(said) - run.position[30:45]).norm(dim=-1)
     assert (apart[-1] < 0.5).all()
-
-
-def errors(name: str, scenario: Scenario) -> Tensor:
-    """Errors in m [K, B] of the first robot in ten worlds."""
-    localizer, world = make(name, scenario), World(scenario, 10)
-    observation, found = world.reset(0), []
-    belief = localizer.reset(observation)
-    for _ in range(60):
-        belief, estimate = localizer.step(belief, observation)
-        found.append((estimate.position - world.truth.position).norm(dim=-1)[:, 0])
-        world.advance(estimate.action())
-        observation = world.observation()
-    return torch.stack(found)
 
 
 def test_a_kidnapped_robot_is_found_again() -> None:

@@ -13,11 +13,12 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from agents import make
-from agents.policies.adapters import LocalizerPolicy
+from agents.policies.adapters import LocalizerPolicy, restored
 from agents.stdcl import loop as loops
 from agents.stdcl.network import StGnn
 from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenarios import make_scenario
 from training.learning import run as runs
 from training.learning import stdcl as training
@@ -29,7 +30,8 @@ from training.learning.augmentation import (
 )
 from training.learning.collectors import episode_collector
 from training.learning.registry import TRAININGS
-from training.learning.stdcl import StDclLoss, far_off
+from training.learning.stdcl import StDclLoss
+from training.learning.through_time import far_off, with_belief
 
 SMALL: dict[str, Any] = {
     "scenario": "swarm-v0:n_uavs=12:anchor_share=0.4:horizon=10:comm_radius=9000",
@@ -60,7 +62,7 @@ def recorded() -> SimpleNamespace:
         weight.data += 0.03 * torch.randn(weight.shape, generator=generator, dtype=torch.float64)
     loop: Any = make("stdcl:weights=none", scenario)
     loop.learn(network)
-    policy = LocalizerPolicy(loop, scenario, record=partial(training._recorded, 0))
+    policy = LocalizerPolicy(loop, scenario, record=partial(with_belief, 0))
     batches = list(episode_collector(CoLocEnv(scenario, 2, seed=5), policy, 4, compact_obs=True))
     loss = StDclLoss(network, [loop], [scenario], [5.0])
     return SimpleNamespace(
@@ -109,13 +111,13 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
     """Position and confidence of a step move the position found in the next one, nearly as the
     first order says that the training follows."""
     loop, batch = recorded.loop, recorded.batch
-    leaves = training.all_leaves(recorded.scenario)
+    leaves = all_leaves(recorded.scenario)
 
     def next_place(shift: float, doubt: float, gradients: bool) -> tuple[Any, Any]:
         seen = batch["uav", "observation"][:, 1]
-        observation = training.Observation({name: seen[name] for name in leaves})
+        observation = Observation({name: seen[name] for name in leaves})
         with torch.no_grad():
-            belief = training.restored(
+            belief = restored(
                 loop.reset(observation),
                 batch["train"].exclude("variant")[:, 1],
                 observation.batch_size,

@@ -12,7 +12,8 @@ from agents.stdcl.factors.network import FactorNetwork
 from agents.weights import learned, untrained
 from training.evaluation.evaluate import silent
 from training.learning import run
-from training.learning.stdcl_factors import pseudo_huber, stdcl_factors
+from training.learning.stdcl_factors import stdcl_factors
+from training.learning.through_time import far_off
 
 TINY: dict[str, Any] = {
     "scenario": "swarm-v0:n_uavs=8:size=3400,3400,1700:horizon=6:comm_radius=2500",
@@ -25,7 +26,7 @@ TINY: dict[str, Any] = {
 
 def test_pseudo_huber_is_square_near_and_linear_far() -> None:
     error = torch.tensor([1e-3, 0.1, 1e4], dtype=torch.float64)
-    found = pseudo_huber(error.square())
+    found = far_off(error.square())
     torch.testing.assert_close(found[:2], error[:2].square(), rtol=1e-3, atol=0)
     assert float(found[2] / error[2]) == pytest.approx(6.0, rel=1e-3)
 
