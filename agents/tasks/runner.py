@@ -10,7 +10,8 @@ from torch import Tensor
 from agents.tasks.memory import TaskMemory
 from agents.tasks.rules import Policy, Seen
 from agents.tasks.task import Task
-from coloc_env.envs.actions import ModeRunner, checked_tensor
+from coloc_env.envs.action_checks import checked_tensor
+from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.world import World
 
 

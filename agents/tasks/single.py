@@ -9,7 +9,9 @@ import torch
 from agents.tasks.faces import built
 from agents.tasks.rules import Seen
 from agents.tasks.task import Task
-from coloc_env.envs.actions import ModeRunner, action_space, checked_arrays, checked_tensor
+from coloc_env.envs.action_checks import checked_arrays, checked_tensor
+from coloc_env.envs.actions import action_space
+from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.observation import flat_box
 from coloc_env.seeding import checked_seed, random_seed
 from coloc_env.world import World

@@ -1,4 +1,4 @@
-"""Action modes: what an action means, what an agent observes for it, and the error for a wrong one.
+"""Action modes: what an action means, and what an agent observes for it.
 
 The world scores estimates, whatever the mode: a mode turns actions into them. Localizers act in
 ``estimate``; learners in ``displacement`` (``coloc_env.envs.displacement``) or with corrections
@@ -6,14 +6,13 @@ on a localizer's estimates (``agents.wrappers.correction.with_base``).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from torch import Tensor
 
 from coloc_env.commands import SILENT, Commands
@@ -21,7 +20,7 @@ from coloc_env.observation import Observation, action_bounds, all_leaves, box, s
 from coloc_env.scenario import Believed, Scenario
 from coloc_env.sensors import AnchorRanging
 from coloc_env.sensors.base import Leaf
-from coloc_env.world import Step, World
+from coloc_env.world import World
 
 Leaves = dict[str, Float32[Tensor, "B N F"]]
 MAX_STATE_ERROR = 100.0  # m: larger errors are cut in the privileged state, whose bounds are finite
@@ -167,77 +166,6 @@ class Estimates(ActionMode):
         return Commands(action[..., 3 * d : 4 * d] if self.largest else None, calls)
 
 
-class ModeRunner:
-    """An action mode at work in the worlds of one environment: it keeps their memory.
-
-    The leaves that it gives are copies, which agents may edit.
-    """
-
-    def __init__(self, mode: ActionMode, world: World) -> None:
-        self.mode, self.world = mode, world
-        self.width = mode.width
-        self._adds_nothing = not mode.leaves and type(mode).reset is ActionMode.reset
-        self._started = self._ahead = False
-        self._commands = Commands()
-        self._memory: Any = None
-        self._leaves: Leaves = {}
-
-    def reset(self, rows: Bool[Tensor, "B"] | None = None) -> Leaves:
-        """Restart the rows that have been reset (None: all) and return every row's leaves at the
-        current step."""
-        if self._adds_nothing:
-            return {}
-        observation = self.world.observation()
-        fresh, leaves = self.mode.observe(self.mode.reset(observation), observation)
-        if rows is not None and self._started and not bool(rows.all()):
-            chosen = rows[:, None].expand(observation.batch_size)
-            fresh = None if fresh is None else fresh.where(chosen, self._memory)
-            leaves = {
-                name: torch.where(rows[:, None, None], leaf, self._leaves[name])
-                for name, leaf in leaves.items()
-            }
-        self._memory, self._leaves, self._started, self._ahead = fresh, leaves, True, False
-        return self._copies()
-
-    def observe(self) -> Leaves:
-        """The leaves at the step that the worlds have moved to."""
-        if self._adds_nothing:
-            return {}
-        if self._ahead:
-            self._ahead = False
-        else:
-            self._memory, self._leaves = self.mode.observe(self._memory, self.world.observation())
-        return self._copies()
-
-    def _copies(self) -> Leaves:
-        return {name: leaf.clone() for name, leaf in self._leaves.items()}
-
-    def estimate(self, action: Float32[Tensor, "B n a"]) -> Float32[Tensor, "B N A"]:
-        """The estimates that actions stand for; what they command waits for ``step``."""
-        self._memory, estimates = self.mode.estimate(self._memory, action)
-        self._commands = self.mode.commands(self._memory, action)
-        return estimates
-
-    def step(self, estimates: Float32[Tensor, "B N A"]) -> Step:
-        """Move the worlds on, estimates scored and commands obeyed; rewards are the mode's."""
-        step = self.world.step(estimates, self._commands)
-        if not self.mode.rewards:
-            return step
-        self.observe()
-        self._ahead = True
-        self._memory, reward = self.mode.reward(self._memory, self.world)
-        return step._replace(reward=reward)
-
-    @property
-    def memory(self) -> Any:
-        """The mode's memory at the step last observed."""
-        return self._memory
-
-    def state(self) -> Float32[Tensor, "B S"]:
-        """What a critic may know."""
-        return self.mode.state(self._memory, self.world)
-
-
 def action_space(mode: ActionMode) -> gym.spaces.Space[Any]:
     """One UAV's actions."""
     if mode.choices is not None:
@@ -283,93 +211,3 @@ def chosen_leaves(
     if scenario.failure_rate or scenario.failures:
         raise ValueError(f"{scenario.name}: UAVs that fail do not fit rows of one UAV each")
     return {name: known[name] for name in names}
-
-
-# ------------------------------------------------------------------ checks of actions
-
-
-def checked_tensor(
-    scenario: Scenario, mode: ActionMode, actions: Tensor, worlds: int
-) -> Float32[Tensor, "B N a"]:
-    """Actions of several worlds as float32. ValueError, in one line that names UAV, world and what
-    is needed, for another shape, complex numbers, and NaN or infinity."""
-    shape: tuple[int, ...] = (worlds, mode.n_agents)
-    if mode.choices is None:
-        shape = (*shape, mode.width)
-    if tuple(actions.shape) != shape:
-        raise ValueError(
-            f"{scenario.name}: actions of shape {tuple(actions.shape)} do not fit: {shape} "
-            f"(worlds, UAVs, {mode.meaning}) is needed with action={mode.name}"
-        )
-    if actions.is_complex():
-        raise ValueError(f"{scenario.name}: complex actions do not fit; {_needed(mode)}")
-    actions = actions.to(torch.float32)
-    finite = actions.isfinite()
-    if not bool(finite.all()):
-        row, uav = (~finite).nonzero()[0, :2].tolist()
-        raise ValueError(
-            f"{scenario.name}: the action of uav_{uav} in world {row} holds NaN or infinity; "
-            f"{_needed(mode)}"
-        )
-    if mode.choices is not None:
-        known = (actions >= 0) & (actions < mode.choices) & (actions == actions.round())
-        if not bool(known.all()):
-            row, uav = (~known).nonzero()[0].tolist()
-            raise ValueError(
-                f"{scenario.name}: the action of uav_{uav} in world {row} is none of the choices; "
-                f"{_needed(mode)}"
-            )
-    return actions
-
-
-def checked_arrays(
-    scenario: Scenario, mode: ActionMode, actions: Mapping[str, Any], agents: Sequence[str]
-) -> Float32[np.ndarray, "n a"]:
-    """The agents' actions, one a row. ValueError, in one line that names the agent and what is
-    needed, for one that is not numeric, complex, of another shape, or holds NaN or infinity."""
-    rows = _array([actions[agent] for agent in agents])
-    if rows is not None and rows.shape == (len(agents), *mode.shape):
-        values = rows.astype(np.float32, copy=False)
-        if np.count_nonzero(np.isfinite(values)) == values.size and _chosen(mode, values):
-            return values
-    return np.stack([_checked_array(scenario, mode, actions[agent], agent) for agent in agents])
-
-
-def _checked_array(
-    scenario: Scenario, mode: ActionMode, action: Any, agent: str
-) -> Float32[np.ndarray, "a"]:
-    values = _array(action)
-    if values is None:
-        wrong = "is not made of real numbers"
-    elif values.shape != mode.shape:
-        wrong = f"has shape {values.shape}"
-    elif not np.isfinite(values.astype(np.float32)).all():
-        wrong = "holds NaN or infinity"
-    elif not _chosen(mode, values):
-        wrong = f"is {values}, none of the choices"
-    else:
-        return values.astype(np.float32)
-    raise ValueError(f"{scenario.name}: the action of {agent} {wrong}; {_needed(mode)}")
-
-
-def _chosen(mode: ActionMode, values: np.ndarray) -> bool:
-    """Whether actions are among the choices, where there are choices."""
-    if mode.choices is None:
-        return True
-    return bool(((values >= 0) & (values < mode.choices) & (values == np.round(values))).all())
-
-
-def _array(numbers: Any) -> np.ndarray | None:
-    """An array of real numbers; None for anything else."""
-    try:
-        array = np.asarray(numbers)
-    except (TypeError, ValueError, RuntimeError):
-        return None
-    return array if array.dtype.kind in "fiub" else None
-
-
-def _needed(mode: ActionMode) -> str:
-    if mode.choices is not None:
-        last = mode.choices - 1
-        return f"0 to {last} is needed with action={mode.name}: {mode.meaning}"
-    return f"({mode.width},) finite numbers are needed with action={mode.name}: {mode.meaning}"

@@ -11,14 +11,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
-from coloc_env.envs.actions import (
-    ActionMode,
-    ModeRunner,
-    action_space,
-    checked_tensor,
-    chosen_leaves,
-    make_mode,
-)
+from coloc_env.envs.action_checks import checked_tensor
+from coloc_env.envs.actions import ActionMode, action_space, chosen_leaves, make_mode
+from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.observation import flat_box
 from coloc_env.render import Renderer
 from coloc_env.scenario import Scenario

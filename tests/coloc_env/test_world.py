@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.envs.actions import Estimates, checked_tensor
+from coloc_env.envs.action_checks import checked_tensor
+from coloc_env.envs.actions import Estimates
 from coloc_env.motion import MOTIONS, Arena
 from coloc_env.network import Network
 from coloc_env.scenario import Prior, Scenario, Wheeled

@@ -20,9 +20,11 @@ from torch import Tensor
 from torchrl.envs import check_env_specs
 
 from agents.wrappers.correction import with_base
-from coloc_env.envs.actions import ActionMode, ModeRunner, checked_tensor, make_mode
+from coloc_env.envs.action_checks import checked_tensor
+from coloc_env.envs.actions import ActionMode, make_mode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.fixes import fixes, relative_fixes
+from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.envs.pettingzoo import CoLocParallelEnv, env, parallel_env
 from coloc_env.envs.sb3 import CoLocVecEnv
 from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv

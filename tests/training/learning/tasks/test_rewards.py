@@ -10,7 +10,7 @@ from agents.tasks import make_task
 from agents.tasks.memory import own_sigma
 from agents.tasks.rules import Seen
 from agents.tasks.task import Task
-from coloc_env.envs.actions import ModeRunner
+from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.world import World
 from training.learning.tasks.environment import environment
 from training.learning.tasks.rewards import Difference
