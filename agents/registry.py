@@ -85,6 +85,12 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     return made
 
 
+def make_inner(name: str, scenario: Scenario | Believed) -> Localizer:
+    """Build a localizer that another thing's option names, whose own options follow ``@`` there:
+    ``ekf@robust=huber``."""
+    return make(name.replace("@", ":"), scenario)
+
+
 def _is_path(*texts: str) -> bool:
     return any("/" in text or ".safetensors" in text for text in texts)
 

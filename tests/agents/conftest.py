@@ -369,7 +369,13 @@ def recorded(name: str, family: str) -> Case:
     return Case(name, family, scenario, localizer, play(localizer, scenario, SEEDS, STEPS))
 
 
-@pytest.fixture(params=CASES, ids="-".join)
+def _pairs(cases: list[tuple[str, str]]) -> list[Any]:
+    """The cases, those slow that are not in ``SAMPLE``."""
+    slow = pytest.mark.slow
+    return [pytest.param(c, marks=() if c in SAMPLE else slow, id="-".join(c)) for c in cases]
+
+
+@pytest.fixture(params=_pairs(CASES))
 def case(request: pytest.FixtureRequest) -> Case:
     """Every localizer in every family of scenarios that it takes."""
     return recorded(*request.param)
@@ -381,7 +387,7 @@ def sample(request: pytest.FixtureRequest) -> Case:
     return recorded(*request.param)
 
 
-@pytest.fixture(params=[c for c in CASES if not _sees_all(c[0])], ids="-".join)
+@pytest.fixture(params=_pairs([c for c in CASES if not _sees_all(c[0])]))
 def local_case(request: pytest.FixtureRequest) -> Case:
     """Every localizer in which each UAV works for itself, in every family that it takes."""
     return recorded(*request.param)
