@@ -47,7 +47,6 @@ LOCALIZERS = Registry(
         "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
-        "stdcl_factors": "agents.stdcl.factors.localizer:LearnedFactors",
         "stgat": "agents.stdcl.stgat:StGat",
         "ukf": "agents.kalman.ukf:UnscentedFilter",
         "vmds": "agents.swarm.vmds:VelocityMds",
