@@ -19,6 +19,7 @@ from training.cli.options import (
     Settings,
     Threads,
     build_scenario,
+    require_device,
     require_seed,
     workers_of,
 )
@@ -79,7 +80,6 @@ def evaluate(
     from coloc_env.staging import staged_folder
 
     built = build_scenario(scenario, settings, threads, data)
-    from training.devices import checked_device
     from training.evaluation import files
     from training.evaluation.evaluate import evaluate as run
     from training.evaluation.evaluate import split_agents
@@ -89,9 +89,7 @@ def evaluate(
 
         plotly_script()  # what is not installed is said before anything runs
     names = split_agents(agents)
-    checked_device(device)
-    if device != "cpu" and (jobs > 1 or ray is not None):
-        raise ValueError(f"--device {device}: one process uses it, not those of --jobs or --ray")
+    require_device(device, jobs, ray)
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
         with workers_of(jobs, ray) as workers, progress() as bars:

@@ -133,6 +133,7 @@ def negative_log_likelihood(
 
 
 def stdcl(
+    device: str = "cpu",
     *,
     scenario: str = "swarm-v0:n_uavs=60:horizon=60",
     variants: str = "/".join(VARIANTS),
@@ -169,9 +170,11 @@ def stdcl(
         raise ValueError(f"stdcl: agent={agent!r} is not allowed: {' or '.join(METHODS)}")
     agent = f"{agent}:weights=none"
     network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=name == "stdcl")
+    network.to(device)
     loops: list[Any] = [make(agent, one) for one in scenarios]
     for loop in loops:
         loop.learn(network)
+        loop.to(device)
     base = agent if name == "stdcl" else BASE  # untrained, stdcl is its optimizer alone
     loss = StDclLoss(network, loops, scenarios, [_scale(base, one) for one in scenarios])
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
@@ -183,9 +186,9 @@ def stdcl(
         first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
         for i, (loop, one) in enumerate(zip(loops, scenarios, strict=True)):
-            env: Any = CoLocEnv(one, worlds, seed=first + i * worlds)
+            env: Any = CoLocEnv(one, worlds, device, seed=first + i * worlds)
             if augment:
-                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i))
+                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i, device))
             policy = LocalizerPolicy(loop, one, record=partial(with_belief, i))
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         return RoundRobin(collectors)
