@@ -46,6 +46,9 @@ def evaluate(
     seed: Seed = 0,
     settings: Settings = None,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw figures.")] = True,
+    vector: Annotated[
+        bool, typer.Option("--vector", help="Draw them as SVG, in place of PNG.")
+    ] = False,
     report: Annotated[
         bool, typer.Option("--report", help="Write report.html, too: see **coloc report**.")
     ] = False,
@@ -100,7 +103,7 @@ def evaluate(
         if report:
             drawn = _drawn("report", partial(files.write_report, found, out.name, folder))
         if figures:
-            drawn = _drawn("figures", partial(files.write_figures, found, folder)) and drawn
+            drawn = _drawn("figures", partial(files.write_figures, found, folder, vector)) and drawn
     typer.echo(f"written to {out}")
     if found.errors or not drawn:
         raise typer.Exit(1)
