@@ -13,6 +13,7 @@ from agents.bank.team import TeamBank
 from agents.kalman.filter import elapsed
 from agents.layers import sigmoid
 from agents.localizer import Estimate, Localizer
+from agents.registry import NotServed
 from agents.stdcl.factors.features import LinkMeans, features, no_means
 from agents.stdcl.factors.network import FactorNetwork
 from agents.swarm.anchored import is_plain
@@ -100,7 +101,7 @@ class LearnedFactors(Localizer[FactorBelief]):
     ) -> None:
         super().__init__(believed)
         if not is_plain(believed) or not isinstance(believed.process, InsDriven):
-            raise ValueError(
+            raise NotServed(
                 "a team is needed whose motion an INS drives, with ranges between centres"
             )
         self.base = RecursiveMap(believed)
