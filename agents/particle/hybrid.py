@@ -15,7 +15,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import Detector, Evidence, evidence
-from agents.registry import make_inner
+from agents.registry import NotServed, make_inner
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -66,7 +66,7 @@ class HybridFilter(Localizer[HybridBelief]):
         super().__init__(believed)
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
-            raise ValueError("the team has no distances to anchors to judge its filter by")
+            raise NotServed("the team has no distances to anchors to judge its filter by")
         self.main: Localizer[Any] = make_inner(main, believed)
         self.auxiliary: Localizer[Any] = make_inner(auxiliary, believed)
         if type(self.main).restart_from is Localizer.restart_from:
