@@ -35,7 +35,7 @@ KINDS: dict[str, dict[str, Any]] = {
     },
     "trust": LEAST | {"scenario": "indoor-v0:n_uavs=2:horizon=5", "steps": 5},
     "stdcl": SWARM,
-    "stdcl_factors": SWARM,
+    "stdcl_loop": SWARM,
     "mappo": POLICY,
     "ippo": POLICY | {"recurrent": False, "base": "none"},
 }

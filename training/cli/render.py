@@ -1,7 +1,6 @@
 """``coloc render``."""
 
 import os
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -79,8 +78,9 @@ def render(
     scale = (width or WIDTH) / WIDTH
     with staged_file(out) as file, progress() as bars:
         localizer = make(agent, built).to(on)
-        count = partial(bars, agent, total=steps)
-        drawn = frames(localizer, built, seed, steps, every, count, on, scale)
+        drawn = frames(
+            localizer, built, seed, steps, every, lambda k: bars(agent, k, steps), on, scale
+        )
         if suffix == ".png":
             frame_to_png(list(drawn)[-1], file)
         else:
