@@ -99,6 +99,7 @@ class HybridFilter(Localizer[HybridBelief]):
         )
 
     def step(self, belief: HybridBelief, observation: Observation) -> tuple[HybridBelief, Estimate]:
+        observation = observation.kept()
         main, estimate = self.main.step(belief.main, observation)
         auxiliary = self.auxiliary.advance(belief.auxiliary, observation)
         seen = evidence(self.model, self.process, self._state(main, estimate), observation)
