@@ -53,7 +53,6 @@ LOCALIZERS = Registry(
         "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
-        "stdcl_factors": "agents.stdcl.factors.localizer:LearnedFactors",
         "stgat": "agents.stdcl.stgat:StGat",
         "ukf": "agents.kalman.ukf:UnscentedFilter",
         "vmds": "agents.swarm.vmds:VelocityMds",
@@ -90,6 +89,12 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
         text, kind = str(error), NotServed if isinstance(error, NotServed) else ValueError
         raise kind(text if text.startswith(name) else f"{name}: {text}") from error
     return made
+
+
+def make_inner(name: str, scenario: Scenario | Believed) -> Localizer:
+    """Build a localizer that another thing's option names, whose own options follow ``@`` there:
+    ``ekf@robust=huber``."""
+    return make(name.replace("@", ":"), scenario)
 
 
 def _is_path(*texts: str) -> bool:

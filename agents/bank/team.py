@@ -25,7 +25,7 @@ class TeamBank(Localizer[BankBelief]):
     centralized = True
 
     def __init__(self, candidate: Any, fallback: Any, options: BankOptions) -> None:
-        """``candidate``: a loop about a swarm filter; ``fallback``: a swarm filter."""
+        """``candidate``: a learned filter of swarms; ``fallback``: a swarm filter."""
         super().__init__(candidate.believed)
         self.name = candidate.name  # type: ignore[misc]
         self.candidate, self.fallback, self.options = candidate, fallback, options
@@ -46,10 +46,13 @@ class TeamBank(Localizer[BankBelief]):
         )
 
     def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
-        base, degrees = self.candidate.base, self.options.degrees
-        ours = range_score(base.predict(belief.candidate.base, observation), base.std, degrees)
-        theirs = range_score(
-            self.fallback.predict(belief.fallback, observation), self.fallback.std, degrees
+        degrees = self.options.degrees
+        ours, theirs = (
+            range_score(branch.predict(state, observation), branch.std, degrees)
+            for branch, state in (
+                (self.candidate, belief.candidate),
+                (self.fallback, belief.fallback),
+            )
         )
         evidence = accumulated(belief.evidence, ours, theirs, self.options.forgetting)
         fallback, classical = self.fallback.step(belief.fallback, observation)

@@ -15,7 +15,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import Detector, Evidence, evidence
-from agents.registry import NotServed, make
+from agents.registry import NotServed, make_inner
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -67,8 +67,8 @@ class HybridFilter(Localizer[HybridBelief]):
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
             raise NotServed("the team has no distances to anchors to judge its filter by")
-        self.main: Localizer[Any] = make(main.replace("@", ":"), believed)
-        self.auxiliary: Localizer[Any] = make(auxiliary.replace("@", ":"), believed)
+        self.main: Localizer[Any] = make_inner(main, believed)
+        self.auxiliary: Localizer[Any] = make_inner(auxiliary, believed)
         if type(self.main).restart_from is Localizer.restart_from:
             raise ValueError(f"main={main!r} is not allowed: a particle or Kalman filter")
         if type(self.auxiliary).gaussian is Localizer.gaussian:

@@ -223,12 +223,8 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         index = torch.arange(n + count, device=position.device)
         own = prior.diagonal(dim1=-2, dim2=-1).mean(-1)
         variance = torch.cat((own, own.new_full((len(prior), count), self.variance)), 1)
-        members = swarm[:, index.clamp_max(n - 1)]
-        memory, covariance, e = members.link_memory, members.joint, members.joint.shape[2]
-        if memory.shape[-1]:
-            to_anchors = swarm.link_memory[..., n:].mT  # a link has one memory for both ends
-            rows = torch.nn.functional.pad(to_anchors, (0, count))
-            memory = torch.cat((swarm.link_memory, rows), 1)
+        members = self.swarm.of_members(swarm, count)
+        covariance, e = members.joint, members.joint.shape[2]
         if covariance.shape[-1]:
             # One covariance for all axes needs links in all directions, which are lacking here.
             full = e == self.process.dim
@@ -240,7 +236,6 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             state=_at_rest(position, anchors),
             variance=variance,
             joint=covariance,
-            link_memory=memory,
         )
 
     def _marginals(

@@ -17,7 +17,7 @@ from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
 from agents.swarm.considered import Moments, after_step
 from agents.swarm.dead_reckoning import DeadReckoning, Predicted
-from agents.swarm.links import Links, connected, lengths, links_of
+from agents.swarm.links import Links, connected, lengths, links_of, of_both_ends
 from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -215,6 +215,16 @@ class SwarmFilter(Localizer[SwarmBelief]):
             velocity=inputs.state[..., d : 2 * d],
             covariance=covariance,
         )
+
+    def of_members(self, belief: SwarmBelief, count: int) -> SwarmBelief:
+        """The belief in N UAVs and ``count`` anchors, M in all, from the UAVs' rows, with memories
+        of links between N and M; an anchor's state is yet to be written."""
+        n = belief.shape[1]
+        index = torch.arange(n + count, device=belief.state.device).clamp_max(n - 1)
+        members = belief[:, index]
+        if not belief.link_memory.shape[-1]:
+            return members
+        return members.replace(link_memory=of_both_ends(belief.link_memory))
 
     def mean(self, belief: SwarmBelief) -> Float64[Tensor, "B N S"]:
         return belief.state

@@ -20,7 +20,7 @@ from training.evaluation.tables import short
 AGENTS = (
     *("ekf", "ekf:robust=huber", "ekf_trust:bank=false", "ekf_trust"),
     *("ekf:robust=huber:fusion=pairwise", "ekf_joint:robust=huber"),
-    *("map", "stdcl:bank=true", "hpff:main=ekf", "nnhpff:main=ekf"),
+    *("map", "stdcl:variant=calibrated:bank=true", "hpff:main=ekf", "nnhpff:main=ekf"),
 )
 CLASSICAL = AGENTS[:2]
 _DASH = "–"
