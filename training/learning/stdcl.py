@@ -104,6 +104,7 @@ class FactorLoss(LossModule):
 
 
 def stdcl(
+    device: str = "cpu",
     *,
     scenario: str = SCENARIO,
     variants: str = "/".join(VARIANTS),
@@ -128,10 +129,11 @@ def stdcl(
     """
     scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl", scenarios, steps)
-    network = learned(FactorNetwork, start, seed, width=width)
+    network = learned(FactorNetwork, start, seed, width=width).to(device)
     localizers: list[Any] = [make(_AGENT, one) for one in scenarios]
     for localizer in localizers:
         localizer.learn(network)
+        localizer.to(device)
     loss = FactorLoss(network, localizers, scenarios, [_scale(one) for one in scenarios])
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
@@ -143,7 +145,7 @@ def stdcl(
         first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
         for i, (localizer, one) in enumerate(zip(localizers, scenarios, strict=True)):
-            env = CoLocEnv(one, worlds, seed=first + i * worlds)
+            env = CoLocEnv(one, worlds, device, seed=first + i * worlds)
             policy = LocalizerPolicy(localizer, one, record=partial(with_belief, i))
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         batches = sum(one.horizon // steps for one in scenarios)

@@ -134,6 +134,7 @@ def negative_log_likelihood(
 
 
 def stdcl_loop(
+    device: str = "cpu",
     *,
     scenario: str = "swarm-v0:n_uavs=60:horizon=60",
     variants: str = "/".join(VARIANTS),
@@ -166,7 +167,9 @@ def stdcl_loop(
     scenarios = [parse_scenario(scenario, variant) for variant in variants.split("/")]
     require_batches("stdcl_loop", scenarios, steps)
     plain = agent == PLAIN
-    network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=not plain)
+    network = learned(StGnn, start, seed, kernel=kernel, levels=levels, kinematic=not plain).to(
+        device
+    )
     if not plain and not agent.startswith(METHODS):
         allowed = " or ".join((*METHODS, PLAIN))
         raise ValueError(f"stdcl_loop: agent={agent!r} is not allowed: {allowed}")
@@ -174,6 +177,7 @@ def stdcl_loop(
     loops: list[Any] = [make(agent, one) for one in scenarios]
     for loop in loops:
         loop.learn(network)
+        loop.to(device)
     base = BASE if plain else agent  # untrained, a loop is its optimizer alone
     loss = StDclLoss(network, loops, scenarios, [_scale(base, one) for one in scenarios])
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
@@ -185,9 +189,9 @@ def stdcl_loop(
         first = world_seed(seed, epoch, worlds * len(scenarios))
         collectors = []
         for i, (loop, one) in enumerate(zip(loops, scenarios, strict=True)):
-            env: Any = CoLocEnv(one, worlds, seed=first + i * worlds)
+            env: Any = CoLocEnv(one, worlds, device, seed=first + i * worlds)
             if augment:
-                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i))
+                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i, device))
             policy = LocalizerPolicy(loop, one, record=partial(with_belief, i))
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         return RoundRobin(collectors)
