@@ -313,7 +313,10 @@ def test_in_ci_a_task_that_is_done_is_a_line(
 def test_in_a_notebook_bars_are_a_widget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     widgets = ModuleType("ipywidgets")
-    monkeypatch.setitem(sys.modules, "ipywidgets", widgets)
+    display = ModuleType("IPython.display")  # the real one, outside a notebook, prints
+    for stands_in in (widgets, ModuleType("IPython"), display):
+        monkeypatch.setitem(sys.modules, stands_in.__name__, stands_in)
+    monkeypatch.setattr(display, "display", MagicMock(), raising=False)
     shown = MagicMock()
     monkeypatch.setattr(widgets, "Output", shown, raising=False)
     with progress() as bars:
