@@ -60,8 +60,11 @@ SWARM_OPTIONS = [
     "dwmds_st:bias=false",
     "map:delays=false",
     "map:confidence=none",
-    "stdcl:feedback=none",
-    "stdcl:feedback=paper",
+    "stdcl:bank=true",
+    "stdcl:variant=calibrated",
+    "stdcl:variant=calibrated:feedback=none",
+    "stdcl:variant=calibrated:feedback=paper",
+    "stdcl:variant=paper",
 ]
 RENAMED: dict[str, str] = {"pfnn_trust": "pf_trust"}  # agents, before → after
 MEANT = "would be ignored"  # refused now: a localizer no longer ignores what a team measures

@@ -64,7 +64,9 @@ class LiveTeam:
         if self._prior is None:
             if self.driver == "imu" and until < start + LEVEL:
                 return False
+            counted = self.samples.surplus  # of windows that are no step's
             self._prior = self._prior_at(Grid(start, self.dt, 2))
+            self.samples.surplus = counted
         return True
 
     def observation(self, until: int, sent: Float32[Tensor, "B N A"] | None) -> Observation:

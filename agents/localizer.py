@@ -7,11 +7,11 @@ from typing import ClassVar, Generic, Self, TypeVar
 import torch
 from jaxtyping import Bool, Float, Float32
 from tensordict import TensorClass
-from torch import Tensor, nn
+from torch import Tensor
 
 from agents.models.measurements import MODELS
 from agents.models.process import Process, drives, make_process
-from agents.parts import parts_of
+from agents.parts import move
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Sensor
@@ -80,13 +80,7 @@ class Localizer(ABC, Generic[Belief]):
     def to(self, device: str | torch.device) -> Self:
         """Move networks and constants to a device, in place; beliefs and observations decide where
         everything else is computed."""
-        for part in parts_of(self):
-            if isinstance(part, nn.Module):
-                part.to(device)
-            elif hasattr(part, "__dict__") and not isinstance(part, Tensor):
-                for name, value in vars(part).items():
-                    if isinstance(value, Tensor):
-                        object.__setattr__(part, name, value.to(device))
+        move(self, device)
         return self
 
     @classmethod

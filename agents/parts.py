@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 
 def parts_of(part: Any, seen: set[int] | None = None) -> Iterator[Any]:
@@ -22,3 +23,14 @@ def parts_of(part: Any, seen: set[int] | None = None) -> Iterator[Any]:
         inside = () if isinstance(part, nn.Module) else vars(part).values()
     for each in inside:
         yield from parts_of(each, seen)
+
+
+def move(owner: Any, device: str | torch.device) -> None:
+    """Move the networks and constants of an object of this package to a device, in place."""
+    for part in parts_of(owner):
+        if isinstance(part, nn.Module):
+            part.to(device)
+        elif hasattr(part, "__dict__") and not isinstance(part, Tensor):
+            for name, value in vars(part).items():
+                if isinstance(value, Tensor):
+                    object.__setattr__(part, name, value.to(device))

@@ -1,8 +1,8 @@
 """Observations: which leaves a scenario's UAVs see, as one batched container and as spaces."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _ACTION = "m, m/s, log m"
 _PRIOR = "m, m/s, attitude; their σ"
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +48,35 @@ class Observation:
     def device(self) -> torch.device:
         return next(iter(self.leaves.values())).device
 
+    def once(self, key: Hashable, read: Callable[[], _T]) -> _T:
+        """What ``read`` makes of the leaves; the first time only, where it is ``kept``."""
+        return read()
+
+    def kept(self) -> "Observation":
+        """The same leaves, of which each thing is read once: for a step of a localizer, in which
+        nobody writes to them."""
+        return _Kept(self.leaves)
+
     def to_tensordict(self) -> "TensorDict":
         """The same leaves with batch size [B, N]."""
         from tensordict import TensorDict  # takes a second, which PettingZoo's users need not wait
 
         return TensorDict(dict(self.leaves), batch_size=self.batch_size, device=self.device)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept(Observation):
+    """With what has been read of it."""
+
+    found: dict[Hashable, Any] = field(default_factory=dict)
+
+    def once(self, key: Hashable, read: Callable[[], _T]) -> _T:
+        if key not in self.found:
+            self.found[key] = read()
+        return self.found[key]
+
+    def kept(self) -> "_Kept":
+        return self
 
 
 def prior_width(dim: int) -> int:

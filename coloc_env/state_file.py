@@ -53,7 +53,7 @@ def _pack(value: Any, tensors: dict[str, Tensor]) -> Any:
     """``value`` as JSON can hold it (keys that are not texts included), tensors by number."""
     if isinstance(value, Tensor):
         name = str(len(tensors))
-        tensors[name] = value.detach().clone().contiguous()
+        tensors[name] = value.detach().cpu().clone().contiguous()
         return {"tensor": name}
     if isinstance(value, Mapping):
         return {"items": [[key, _pack(item, tensors)] for key, item in value.items()]}

@@ -10,6 +10,8 @@ from typing import Any
 # on where in memory the row lies. It has to be said before MKL is first used.
 os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
+os.environ.pop("CI", None)  # in which commands say more
+
 import pytest
 import torch
 

@@ -1,4 +1,4 @@
-"""A bank for filters that estimate a whole team at once: a learned loop falls back to ``map``."""
+"""A bank for filters that estimate a whole team at once: what is learned falls back to ``map``."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from coloc_env.observation import Observation
 
 
 class TeamBank(SideBySide):
-    """A loop about a swarm filter beside a swarm filter: evidence is of ranges between UAVs. What
+    """A learned filter of swarms beside a swarm filter: evidence is of ranges between UAVs. What
     restarts is moved to where the other has it."""
 
     name = "team_bank"
@@ -30,7 +30,7 @@ class TeamBank(SideBySide):
     def scores(
         self, before: BankBelief, after: BankBelief, observation: Observation
     ) -> tuple[Float64[Tensor, "B N"], Float64[Tensor, "B N"]]:
-        pairs = (self.candidate.base, before.candidate.base), (self.fallback, before.fallback)
+        pairs = (self.candidate, before.candidate), (self.fallback, before.fallback)
         ours, theirs = (
             range_score(one.predict(belief, observation), one.std, self.options.degrees)
             for one, belief in pairs

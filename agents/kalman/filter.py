@@ -110,6 +110,7 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
+        observation = observation.kept()
         x, covariance, f = self.predict(belief, observation)
         prior = Prediction(x, covariance, observation, belief.memory)
         considered = self.biases.predict(belief.considered, f, observation)

@@ -138,6 +138,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
     def step(
         self, belief: ParticleBelief, observation: Observation
     ) -> tuple[ParticleBelief, Estimate]:
+        observation = observation if self.compiled else observation.kept()
         key, neighbours = (
             noise.fold(belief.key, belief.step),
             no_neighbours(belief.last[..., : self.process.dim]),

@@ -17,7 +17,7 @@ from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import Detector, Evidence, evidence
 from agents.particle.filter import ParticleFilter
-from agents.registry import make
+from agents.registry import NotServed, make_inner
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -69,9 +69,9 @@ class HybridFilter(Localizer[HybridBelief]):
         super().__init__(believed)
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
-            raise ValueError("the team has no distances to anchors to judge its filter by")
-        self.main: Localizer[Any] = make(main.replace("@", ":"), believed)
-        self.auxiliary: Localizer[Any] = make(auxiliary.replace("@", ":"), believed)
+            raise NotServed("the team has no distances to anchors to judge its filter by")
+        self.main: Localizer[Any] = make_inner(main, believed)
+        self.auxiliary: Localizer[Any] = make_inner(auxiliary, believed)
         if type(self.main).restart_from is Localizer.restart_from:
             raise ValueError(f"main={main!r} is not allowed: a particle or Kalman filter")
         if type(self.auxiliary).gaussian is Localizer.gaussian:
@@ -104,6 +104,7 @@ class HybridFilter(Localizer[HybridBelief]):
         )
 
     def step(self, belief: HybridBelief, observation: Observation) -> tuple[HybridBelief, Estimate]:
+        observation = observation.kept()
         main, estimate = self.main.step(belief.main, observation)
         auxiliary = self.auxiliary.advance(belief.auxiliary, observation)
         seen = evidence(self.model, self.process, self._state(main, estimate), observation)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.models.process import drives
+from agents.registry import NotServed
 from agents.stdcl.features import GraphInputs, RunningMeans, graph_inputs, initial_means
 from agents.stdcl.feedback import FEEDBACKS, KAPPA, FeedbackKind
 from agents.stdcl.network import ConvolutionState, Correction, StGnn
@@ -56,10 +57,10 @@ class NetworkLoop(Localizer[LoopBelief]):
     ) -> None:
         super().__init__(base.believed)
         if not is_plain(base.believed):
-            raise ValueError(
+            raise NotServed(
                 "a team is needed whose motion an INS drives, with ranges between centres"
             )
-        self.base, self.feedback = base, FEEDBACKS[feedback](kappa)
+        self.base, self.feedback, self.std = base, FEEDBACKS[feedback](kappa), base.std
         self.rate = min(1.0, base.believed.arena.dt / _TRAINING_DT)
         self.network = network.double().requires_grad_(False)
 
@@ -97,16 +98,20 @@ class NetworkLoop(Localizer[LoopBelief]):
             confidence=base.variance.new_ones(*shape, shape[1]),
         )
 
+    def predict(self, belief: LoopBelief, observation: Observation) -> StepInput:
+        """The optimizer's dead reckoning to the observation's step, its fixes and links."""
+        return self.base.predict(belief.base, observation)
+
     def step(self, belief: LoopBelief, observation: Observation) -> tuple[LoopBelief, Estimate]:
         with torch.no_grad():
-            inputs = self.base.predict(belief.base, observation)
+            inputs = self.predict(belief, observation)
             if self.feedback.links:
                 inputs = replace(inputs, confidence=belief.confidence)
             solution = self.base.solve(belief.base, inputs)
             weight, shift = self.base.weights(solution.position, inputs)
             limit = self._max_offset(inputs, solution)
             graph, means = graph_inputs(
-                inputs, solution, weight, shift, self.base.std, belief.means, limit
+                inputs, solution, weight, shift, self.std, belief.means, limit
             )
         correction, convolutions = self.network(graph, belief.convolutions)
         if torch.is_grad_enabled():
@@ -121,7 +126,7 @@ class NetworkLoop(Localizer[LoopBelief]):
             means=means,
             convolutions=convolutions,
             confidence=self.feedback.confidence(
-                belief.confidence, inputs, corrected, correction, self.base.std
+                belief.confidence, inputs, corrected, correction, self.std
             ),
         )
         return after, self.base.estimate(inputs, corrected)

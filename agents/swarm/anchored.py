@@ -20,6 +20,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements
 from agents.models.process import make_process
+from agents.registry import NotServed
 from agents.swarm import joint
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.centres import Centres
@@ -78,7 +79,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         super().__init__(believed)
         ranging = believed.sensor(Ranging)
         if ranging is None:
-            raise ValueError("a team with ranges between UAVs is needed")
+            raise NotServed("a team with ranges between UAVs is needed")
         self.process = make_process(believed)
         self.navigation = NavigationFilter(believed, self.process)
         self.centres = Centres(believed, ranging)
@@ -89,7 +90,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         self.swarm = swarm
         self.variance = max(fixes.axis_std(self.process.dim)) ** 2
         if self.swarm.window:
-            raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
+            raise NotServed("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
         models = make_measurements(believed)
         self.biases = Biases([m for m in models if m.bias_std], self.process.dt)
@@ -222,12 +223,8 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         index = torch.arange(n + count, device=position.device)
         own = prior.diagonal(dim1=-2, dim2=-1).mean(-1)
         variance = torch.cat((own, own.new_full((len(prior), count), self.variance)), 1)
-        members = swarm[:, index.clamp_max(n - 1)]
-        memory, covariance, e = members.link_memory, members.joint, members.joint.shape[2]
-        if memory.shape[-1]:
-            to_anchors = swarm.link_memory[..., n:].mT  # a link has one memory for both ends
-            rows = torch.nn.functional.pad(to_anchors, (0, count))
-            memory = torch.cat((swarm.link_memory, rows), 1)
+        members = self.swarm.of_members(swarm, count)
+        covariance, e = members.joint, members.joint.shape[2]
         if covariance.shape[-1]:
             # One covariance for all axes needs links in all directions, which are lacking here.
             full = e == self.process.dim
@@ -239,7 +236,6 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
             state=_at_rest(position, anchors),
             variance=variance,
             joint=covariance,
-            link_memory=memory,
         )
 
     def _marginals(

@@ -11,12 +11,13 @@ from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import UavRanges
 from agents.models.process import make_process
+from agents.registry import NotServed
 from agents.swarm import calibration, delays, ins_bias, joint, joint_bias, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
 from agents.swarm.considered import Moments, after_step
 from agents.swarm.dead_reckoning import DeadReckoning, Predicted
-from agents.swarm.links import Links, connected, lengths, links_of
+from agents.swarm.links import Links, connected, lengths, links_of, of_both_ends
 from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -63,7 +64,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
         if sensor is None or sensor.tags:
-            raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
+            raise NotServed("a team with ranges between UAVs, without lever arms, is needed")
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.range_models = [UavRanges(sensor)]
         self.confidence = CONFIDENCES[confidence](self.std)
@@ -214,6 +215,16 @@ class SwarmFilter(Localizer[SwarmBelief]):
             velocity=inputs.state[..., d : 2 * d],
             covariance=covariance,
         )
+
+    def of_members(self, belief: SwarmBelief, count: int) -> SwarmBelief:
+        """The belief in N UAVs and ``count`` anchors, M in all, from the UAVs' rows, with memories
+        of links between N and M; an anchor's state is yet to be written."""
+        n = belief.shape[1]
+        index = torch.arange(n + count, device=belief.state.device).clamp_max(n - 1)
+        members = belief[:, index]
+        if not belief.link_memory.shape[-1]:
+            return members
+        return members.replace(link_memory=of_both_ends(belief.link_memory))
 
     def mean(self, belief: SwarmBelief) -> Float64[Tensor, "B N S"]:
         return belief.state

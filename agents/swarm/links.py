@@ -57,6 +57,14 @@ def lengths(position: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B N N"]:
     return apart.clamp_min(1e-9)
 
 
+def of_both_ends(memory: Float64[Tensor, "B N M"]) -> Float64[Tensor, "B M M"]:
+    """What is remembered of links between M members, from the rows of the first N of them: it is
+    the same at both ends, and nothing of links between the others."""
+    n, m = memory.shape[1:]
+    rows = torch.nn.functional.pad(memory[..., n:].mT, (0, m - n))
+    return torch.cat((memory, rows), 1)
+
+
 def connected(mask: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N N"]:
     """Pairs in the same connected component of the network, each UAV with itself."""
     reach = mask.clone()

@@ -9,16 +9,17 @@ from coloc_env.motion.steered import Control, Jerk
 from coloc_env.options import Group, Metres, Quantity
 
 Drift = Annotated[float, Quantity("m/√m", 0.0)]
-ESTIMATOR = "ekf_joint:second_order=true:iterations=1"
+ESTIMATOR = "ekf_joint@second_order=true@iterations=1"
 
 
 @dataclass(frozen=True)
 class TaskOptions(Group):
-    """``estimator``: in the loop, by name. ``reward``: of the ``true`` error, or of the
-    estimator's own ``sigma``, less noisy to learn from (scores are of the true error either way).
-    ``credit``: every UAV gets the ``team``'s mean reward, or its ``own``. ``telemetry``: agents see
-    all others' estimates (``free``), or what they heard last, with its age (``messages``).
-    ``obs``: one ``flat`` vector, or a ``dict`` of its parts.
+    """``estimator``: in the loop, by name, its options after ``@`` (``ekf@fusion=ci``).
+    ``reward``: of the ``true`` error, or of the estimator's own ``sigma``, less noisy to learn from
+    (scores are of the true error either way). ``credit``: every UAV gets the ``team``'s mean
+    reward, or its ``own``. ``telemetry``: agents see all others' estimates (``free``), or what they
+    heard last, with its age (``messages``). ``obs``: one ``flat`` vector, or a ``dict`` of its
+    parts.
     """
 
     title: ClassVar[str] = "task"

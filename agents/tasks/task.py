@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agents.localizer import Localizer
-from agents.registry import make
+from agents.registry import make_inner
 from agents.tasks.memory import TaskMemory, joint_covariance, own_covariance, total_sigma
 from agents.tasks.observation import (
     ABOUT,
@@ -84,7 +84,7 @@ class Task(ActionMode):
         self.flat = chosen.obs == "flat"
         if self.shared and chosen.credit == "own":
             raise ValueError(f"{self.name}: credit='own' is not allowed: rewards are the team's")
-        self.estimator: Localizer[Any] = make(chosen.estimator, scenario)
+        self.estimator: Localizer[Any] = make_inner(chosen.estimator, scenario)
         self.radius, self.v_max, self.a_max = radius, v_max, a_max
         self.control = chosen.control if isinstance(chosen, SteeredTaskOptions) else "velocity"
         self.scale = v_max if self.control == "velocity" else a_max

@@ -19,7 +19,8 @@ class LocalizedTransform(Transform):
     observations [B, N, F] lie at ``key``.
 
     ``task.positions`` and ``task.entries`` are given the environment that is wrapped. Seeds of the
-    noise follow the environment's ``set_seed``.
+    noise follow the environment's ``set_seed``. Beside the observations, under ``info``, is each
+    agent's ``localization_error`` [B, N, 1] in m.
     """
 
     def __init__(
@@ -29,7 +30,8 @@ class LocalizedTransform(Transform):
         key: NestedKey = ("agents", "observation"),
         **overrides: Any,
     ) -> None:
-        super().__init__(in_keys=[key], out_keys=[key])
+        beside = () if isinstance(key, str) else key[:-1]
+        super().__init__(in_keys=[key], out_keys=[key, (*beside, "info", "localization_error")])
         self.task, self._localizer, self._overrides = task, localizer, overrides
         self.team: Localization | None = None
         self._seeds = NoiseSeeds()
@@ -69,11 +71,15 @@ class LocalizedTransform(Transform):
             replaced(row, self.task.entries(env, i), places, self.team, i, env)
             for i, row in enumerate(rows)
         ]
-        return tensordict.set(key, torch.stack(known, 1).reshape(seen.shape).to(seen))
+        tensordict.set(key, torch.stack(known, 1).reshape(seen.shape).to(seen))
+        error = self.team.error.reshape(*seen.shape[:-1], 1)
+        return tensordict.set(self.out_keys[1], error.to(seen.device))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Estimates have no bounds."""
-        key = self.in_keys[0]
+        key, error = self.out_keys
         old = observation_spec[key]
         observation_spec[key] = Unbounded(shape=old.shape, dtype=old.dtype, device=old.device)
+        shape = (*old.shape[:-1], 1)
+        observation_spec[error] = Unbounded(shape=shape, device=old.device)
         return observation_spec

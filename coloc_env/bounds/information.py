@@ -30,6 +30,7 @@ from coloc_env.sensors import (
     Landmarks,
     OpticalFlow,
     PositionFix,
+    RangeNoise,
     Ranging,
     Sensor,
     Tdoa,
@@ -131,15 +132,19 @@ def anchor_rows(
 
 @own_information.register
 def _tdoa(sensor: Tdoa, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
-    """z = ‖t − A_n‖ − ‖t − A_m‖ + N(0, σ²), t = p + R l: by t it changes as u_n − u_m."""
+    """z = ‖t − A_n‖ − ‖t − A_m‖ + e, t = p + R l: by t it changes as u_n − u_m. e: N(0, σ²), or a
+    mixture of two."""
     shape = (sensor.depth, sensor.n_tags, -1)
     count = _mask(seen, "tdoa_mask").unflatten(-1, shape).sum(-3)  # [B, N, T, P]
     tags, jacobian = _tags(truth, sensor.tags)
     unit = _unit(tags.unsqueeze(-2) - _points(seen, "tdoa_map", truth).unsqueeze(2))
     m, n = sensor.ends
     rows = (unit[..., n, :] - unit[..., m, :]) @ jacobian
-    weights = count / max(sensor.std, EXACT) ** 2
-    return _gram(rows.flatten(2, 3).unsqueeze(-2), weights.flatten(2))
+    std = max(sensor.std, EXACT)
+    each = 1 / std**2
+    if sensor.tail:
+        each = range_information(RangeNoise(std, tail=sensor.tail, tail_std=sensor.tail_std))
+    return _gram(rows.flatten(2, 3).unsqueeze(-2), (count * each).flatten(2))
 
 
 @own_information.register

@@ -18,7 +18,7 @@ _SIZE = (WIDTH / DPI, HEIGHT / DPI)  # inches
 class Canvas(Protocol):
     """What the renderer draws on."""
 
-    def __init__(self, scenario: Scenario) -> None: ...
+    def __init__(self, scenario: Scenario, scale: float) -> None: ...
 
     def draw(
         self, snapshot: Snapshot, history: History, alive: np.ndarray
@@ -30,8 +30,8 @@ class Canvas(Protocol):
 class Image:
     """Pictures as arrays; pyplot and its backend are never touched."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        figure = Figure(figsize=_SIZE, dpi=DPI, facecolor="white")
+    def __init__(self, scenario: Scenario, scale: float) -> None:
+        figure = Figure(figsize=_SIZE, dpi=scale * DPI, facecolor="white")
         self._canvas = FigureCanvasAgg(figure)
         self._picture = Picture(figure, scenario)
 
@@ -48,13 +48,13 @@ class Image:
 class Window:
     """A pyplot window, updated in place; one that the user closed stays closed."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, scale: float) -> None:
         import matplotlib.pyplot as plt
         from matplotlib.backends import BackendFilter, backend_registry
 
         hint = "use render_mode='rgb_array', which needs no display"
         try:
-            figure = plt.figure(figsize=_SIZE, dpi=DPI, facecolor="white")
+            figure = plt.figure(figsize=_SIZE, dpi=scale * DPI, facecolor="white")
         except Exception as error:  # each backend has its own
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise RuntimeError(f"render_mode='human' found no display ({reason}); {hint}") from None

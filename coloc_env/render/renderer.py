@@ -22,10 +22,11 @@ class Renderer:
     picture is wanted, ``reset`` when a new episode starts. A picture shows the last step recorded:
     truth, measurements and the estimates of that very step; before the first, the world as it
     stands. Figures are made at the first picture and kept; they do not travel with a pickle.
+    ``scale`` times a size of 1200 by 750 pixels.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
+    def __init__(self, scenario: Scenario, scale: float = 1.0) -> None:
+        self.scenario, self.scale = scenario, scale
         self._canvases: dict[str, Canvas] = {}
         self.reset()
 
@@ -50,7 +51,7 @@ class Renderer:
         if mode not in self._canvases:
             from coloc_env.render.canvas import CANVASES
 
-            self._canvases[mode] = CANVASES[mode](self.scenario)
+            self._canvases[mode] = CANVASES[mode](self.scenario, self.scale)
         return self._canvases[mode].draw(snapshot, self._history, world.alive[0].cpu().numpy())
 
     def close(self) -> None:

@@ -74,8 +74,9 @@ def indoor(
     if anchors.anchors:
         true.append(anchors.true(room, ranges.true, arms))
         believed.append(anchors.believed(room, ranges.believed, arms))
-    others = (*tdoa.true(room, arms), *angles.true, *gnss.true(team.n_uavs))
-    others = (*others, *flow.true, *barometer.true)
+    true += tdoa.true(room, arms)
+    believed += tdoa.believed(room, arms)
+    others = (*angles.true, *gnss.true(team.n_uavs), *flow.true, *barometer.true)
     true += others
     believed += others
     return Scenario(

@@ -22,7 +22,8 @@ class Tdoa(Sensor):
     in turn are heard: Hamer & D'Andrea, "Self-calibrating ultra-wideband network supporting
     multi-robot localization", IEEE Access 6, 2018; what Crazyflies fly). ``depth`` D: how many
     measurements of one pair a step can deliver. A share ``dropout`` is missing; ``radius``: both
-    anchors lie within so many m.
+    anchors lie within so many m. A share ``tail`` has noise of ``tail_std`` m instead: of either
+    sign, since it is late if the way to A_n is blocked, and early if that to A_m is.
     """
 
     anchors: tuple[tuple[float, ...], ...]
@@ -32,6 +33,8 @@ class Tdoa(Sensor):
     depth: int = 1
     dropout: float = 0.0
     radius: float | None = None
+    tail: float = 0.0
+    tail_std: float = 1.0
 
     def __post_init__(self) -> None:
         count = len(self.anchors)
@@ -39,6 +42,8 @@ class Tdoa(Sensor):
         require(self.std >= 0, self, "std", "a standard deviation in m ≥ 0")
         known = all(m != n and 0 <= m < count and 0 <= n < count for m, n in self.pairs)
         require(known, self, "pairs", f"pairs of different indices of the {count} anchors")
+        require(0 <= self.tail <= 1, self, "tail", "a probability in [0, 1]")
+        require(self.tail_std >= 0, self, "tail_std", "a standard deviation in m ≥ 0")
         require(self.depth >= 1, self, "depth", "at least one measurement")
         require(0 <= self.dropout <= 1, self, "dropout", "a probability in [0, 1]")
         require(self.radius is None or self.radius > 0, self, "radius", "a distance in m > 0")
@@ -88,5 +93,9 @@ class Tdoa(Sensor):
         if self.dropout:
             drawn = noise.uniform(window.keys, "tdoa.dropout", shape[0] * shape[1])
             heard = heard & (drawn.unflatten(-1, shape) >= self.dropout)
-        mask = heard.to(torch.float32)
-        return {"tdoa": (exact + self.std * white) * mask, "tdoa_mask": mask}
+        mask, error = heard.to(torch.float32), self.std * white
+        if self.tail:
+            drawn = noise.uniform(window.keys, "tdoa.tail", shape[0] * shape[1])
+            wild = drawn.unflatten(-1, shape) < self.tail
+            error = torch.where(wild, self.tail_std * white, error)
+        return {"tdoa": (exact + error) * mask, "tdoa_mask": mask}

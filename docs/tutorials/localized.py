@@ -100,4 +100,5 @@ Localized(task, mine).reset(seed=1)[1]
 # %% [markdown]
 # VMAS scenarios go through `agents.wrappers.localized_vmas`, other TorchRL environments through
 # `agents.wrappers.localized_torchrl.LocalizedTransform`. With `std=True` agents also see how sure
-# the localizer is. `training/examples/localized.py` trains policies on the truth and on estimates.
+# the localizer is. `training/examples/localized.py` and `localized_spread.py` train policies on the
+# truth and on estimates: [what came of it](../results/localized.md).

@@ -134,8 +134,7 @@ CHOSEN = {
     "dwmds": ("ranges", "anchors", "many", "tags"),
     "vmds": ("ranges", "anchors"),
     **dict.fromkeys(("fcmds", "gn"), ("anchors", "many", "tags")),
-    "stdcl": ("swarm", "campus"),
-    "stdcl_factors": ("swarm",),
+    "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
@@ -153,6 +152,7 @@ CASES = [
     *((n, "biased") for n in ("ekf", "ekf_joint", "ekf:fusion=pairwise")),
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
+    *(("stdcl:variant=calibrated", f) for f in ("swarm", "campus")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
 ]
 CASES = [case for case in CASES if case not in REFUSED]
@@ -211,7 +211,7 @@ def room(name: str, **overrides: Any) -> Scenario:
     chosen = CHOSEN.get(name, ("default",))
     if "stein2d" in chosen:
         return make_scenario("stein2d-v0", **overrides)
-    if name in ("stdcl", "stdcl_factors", "stgat"):
+    if name in ("stdcl", "stgat"):
         return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
     if "sight" in chosen:
         return make_scenario("indoor-v0", uwb=False, **overrides)
@@ -369,7 +369,13 @@ def recorded(name: str, family: str) -> Case:
     return Case(name, family, scenario, localizer, play(localizer, scenario, SEEDS, STEPS))
 
 
-@pytest.fixture(params=CASES, ids="-".join)
+def _pairs(cases: list[tuple[str, str]]) -> list[Any]:
+    """The cases, those slow that are not in ``SAMPLE``."""
+    slow = pytest.mark.slow
+    return [pytest.param(c, marks=() if c in SAMPLE else slow, id="-".join(c)) for c in cases]
+
+
+@pytest.fixture(params=_pairs(CASES))
 def case(request: pytest.FixtureRequest) -> Case:
     """Every localizer in every family of scenarios that it takes."""
     return recorded(*request.param)
@@ -381,7 +387,7 @@ def sample(request: pytest.FixtureRequest) -> Case:
     return recorded(*request.param)
 
 
-@pytest.fixture(params=[c for c in CASES if not _sees_all(c[0])], ids="-".join)
+@pytest.fixture(params=_pairs([c for c in CASES if not _sees_all(c[0])]))
 def local_case(request: pytest.FixtureRequest) -> Case:
     """Every localizer in which each UAV works for itself, in every family that it takes."""
     return recorded(*request.param)

@@ -42,7 +42,7 @@ CASES = [
     *(("indoor-v0", x) for x in ("ekf:robust=huber+gate+ransac+temporal+cross", "pf800")),
     *(("campus-v0", x) for x in ("ekf", "map", "stdcl")),
     *(("swarm-v0", x) for x in ("dwmds_st", "dwmds", "map", "gn", "mds", "fcmds", "vmds")),
-    *(("swarm-v0", x) for x in ("stdcl", "stdcl_factors", "stgat")),
+    *(("swarm-v0", x) for x in ("stdcl", "stdcl:variant=calibrated", "stgat")),
     *(("stein2d-v0", x) for x in ("cspf", "pf_joint")),
     *(("stein3d-v0", x) for x in ("cspf", "pf_joint")),
     ("wsn-v0", "nnhpff"),

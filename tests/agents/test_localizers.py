@@ -13,6 +13,7 @@ from agents.policies.learned import PolicyAgent
 from agents.stein.team import RelativeTeam
 from agents.swarm.gn import Snapshot
 from coloc_env.observation import Observation, action_width
+from tests.sampling import crossed
 
 EXACT = 0.0
 SUMMED = 1e-10  # relative, for products of matrices over a whole team, summed in another order
@@ -124,8 +125,7 @@ def test_rows_do_not_depend_on_how_many_there_are(name: str, tools: SimpleNamesp
         tools.assert_same(alone.beliefs[-1], many.beliefs[-1][seed : seed + 1], tolerance)
 
 
-@pytest.mark.parametrize("n_uavs", [1, 2])
-@pytest.mark.parametrize("name", LOCALIZERS)
+@pytest.mark.parametrize(("name", "n_uavs"), crossed(LOCALIZERS, [1, 2], every=2))
 def test_a_row_of_a_small_team_is_its_own_run(
     name: str, n_uavs: int, tools: SimpleNamespace
 ) -> None:

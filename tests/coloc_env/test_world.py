@@ -28,6 +28,7 @@ from coloc_env.sensors import (
     UavBearings,
 )
 from coloc_env.world import World
+from tests.sampling import crossed
 
 Record = dict[str, Tensor]
 
@@ -112,8 +113,7 @@ def same(batch: Record, row: int, single: Record, but: Sequence[str] = ()) -> No
             assert torch.equal(batch[name][row], value[0]), name
 
 
-@pytest.mark.parametrize("window", [None, 7])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("variant", "window"), crossed(VARIANTS, [None, 7], every=2))
 def test_each_row_is_the_world_of_its_seed(variant: str, window: int | None) -> None:
     scenario = make_scenario("indoor-v0", **VARIANTS[variant])
     seeds = [3 * b + 5 for b in range(37)]

@@ -116,6 +116,7 @@ def test_a_picture() -> None:
         ["reproduce", "cspf"],
         ["render", "indoor-v0"],
         ["bench"],
+        ["train", "trust"],
     ],
     ids=lambda words: words[0],
 )

@@ -129,6 +129,61 @@ def test_localized_learns_on_estimates() -> None:
     assert 0 < last["error"] < 3
 
 
+def test_spread_is_the_same_task_in_other_orders_and_axes() -> None:
+    """The controller does to mirrored observations what is mirrored of what it does."""
+    module = example("localized_spread", "mpe2")
+    torch.manual_seed(0)
+    seen = torch.cat((torch.randn(60, 14), torch.zeros(60, 4)), 1)
+    actions = module.controller(seen.unsqueeze(1)).flatten()
+    assert len(set(actions.tolist())) >= 4
+    for _ in range(8):
+        turned, wanted = module.mirrored(seen, actions)
+        assert torch.equal(module.controller(turned.unsqueeze(1)).flatten(), wanted)
+
+
+def test_spread_side_by_side_is_spread_localized() -> None:
+    from agents.wrappers.adapters import simple_spread
+    from agents.wrappers.localized import Localized
+
+    module = example("localized_spread", "mpe2")
+    worlds = module.Worlds(2, "4 anchors, 30 % NLOS", 5)
+    true, task = worlds.reset(), module.simple_spread_v3.parallel_env(max_cycles=25)
+    alone = Localized(task, simple_spread, anchors=4, nlos=0.3)
+    seen, _ = alone.reset(seed=6)
+    for _ in range(4):
+        rows = torch.stack([torch.from_numpy(seen[name]) for name in alone.agents])
+        torch.testing.assert_close(worlds.known(true)[1], rows.float(), rtol=0, atol=1e-4)
+        actions = module.controller(true)
+        true, gained = worlds.step(actions)
+        mine = dict(zip(alone.agents, actions[1].tolist(), strict=True))
+        seen, rewards, *_ = alone.step(mine)
+        np.testing.assert_allclose(gained[1], list(rewards.values()))
+
+
+@pytest.mark.slow
+def test_spread_is_learnt_from_estimates() -> None:
+    module = example("localized_spread", "mpe2")
+    estimates = "ranges between agents only"
+    with torch.random.fork_rng():
+        policies = (
+            lambda seen: torch.randint(5, seen.shape[:2]),
+            module.trained(estimates, 0, rounds=3, worlds=40),
+        )
+        first, last = (module.measured(policy, estimates, 64) for policy in policies)
+    assert last["return"] > first["return"] + 4
+    assert 0 < last["error"] < 3
+
+
+@pytest.mark.slow
+def test_live_minutes_are_located_and_timed() -> None:
+    found = example("live_hour").run(seconds=40, speed=1000)
+    assert found["rmse_m"] < 1.0
+    assert 50 < found["memory_mb"][0] < 2000
+    assert "steps 400" in found["summary"][0]
+    assert "second of one link" not in "".join(found["summary"])
+    assert "95th percentile" in found["summary"][-1]
+
+
 def test_benchmarl_runs_tasks_by_its_own_command(tmp_path: Path) -> None:
     """MAPPO where actions are numbers, QMIX where they are choices and masked."""
     example("benchmarl_tasks", "benchmarl", "hydra")

@@ -9,7 +9,6 @@ from typing import Any, cast
 from agents import LOCALIZERS, make
 from agents.factor_graph.pose_graph import PoseGraph
 from agents.particle.hybrid import HybridFilter
-from agents.stdcl.factors.localizer import LearnedFactors
 from agents.stdcl.loop import NetworkLoop
 from agents.stein.stein_vi import SteinViFilter
 from agents.stein.team import RelativeTeam
@@ -78,7 +77,7 @@ def time_agents(
 
 def _at_home(name: str) -> Iterator[Task]:
     kind = cast(type, LOCALIZERS[name])
-    if issubclass(kind, SwarmFilter | NetworkLoop | LearnedFactors):
+    if issubclass(kind, SwarmFilter | NetworkLoop):
         for words, scenario in _SWARMS.items():
             yield Task("swarms", f"{name}, {words}", name, scenario)
     elif issubclass(kind, RelativeTeam):

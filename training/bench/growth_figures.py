@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from coloc_env.render.style import uav_colours
+from coloc_env.render.style import UAV_COLOURS, uav_colours
 from training.evaluation.figures import STYLE
 
 _AXES = {
@@ -27,11 +27,12 @@ def growth_figure(results: dict[str, Any]) -> Figure:
         axes = figure.subplots(2, len(_AXES), sharex="col")
         names = list(dict.fromkeys(one["name"] for one in results["sweeps"]))
         colours = dict(zip(names, uav_colours(len(names)), strict=True))
+        markers = {name: "os^"[i // len(UAV_COLOURS)] for i, name in enumerate(names)}
         for column, (key, label) in enumerate(_AXES.items()):
             for one in (each for each in results["sweeps"] if each["key"] == key):
                 look = {
                     "color": colours[one["name"]],
-                    "marker": "o",
+                    "marker": markers[one["name"]],
                     "markersize": 3,
                     "linestyle": "--" if one["scenario"] != "indoor-v0" else "-",
                     "label": f"{one['name']}, {one['scenario']}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,7 +48,7 @@ class Sweep:
 @torch.no_grad()
 def measure(sweep: Sweep, device: torch.device, seconds: float) -> dict[str, list[float]]:
     """By size: ``ms`` of a step of worlds and agent, of which ``agents_ms`` is the agent's; bytes
-    that torch allocates at the height of a step, and of the ``belief``.
+    that torch allocates at the height of a step, sensing included, and of the ``belief``.
 
     Times are this process's own, whatever else the machine does (on a card: the card's). What
     worlds sense ahead is shared by the steps that it serves; the agent's is the median of about
@@ -95,9 +95,12 @@ class _Case:
         self.belief: Any = None
 
     def world_seconds(self) -> float:
-        """Of a step, on average over those that are sensed at once."""
+        """Of a step, on average over those that are sensed at once; an episode that fits into one
+        window is sensed as it starts."""
         steps = min(self.world.window, self.horizon - 1)
         start = self._now()
+        if self.world.window >= self.horizon:
+            self.world.reset(0)
         for _ in range(steps):
             self.world.advance(self.action)
             self.world.observation()
@@ -118,19 +121,16 @@ class _Case:
         return spent
 
     def peak(self) -> int:
-        """Bytes allocated at the height of a step, as torch counts them."""
+        """Bytes allocated at the height of a step, as torch counts them: of the agent's work, or of
+        the sensing of a window, whichever is more."""
+        agent = self._allocated(self.step) if self.localizer is not None else 0
+        return max(agent, self._allocated(lambda: self.world.reset(0)))
 
-        def whole() -> None:
-            if self.localizer is None:
-                self.world.advance(self.action)
-                self.world.observation()
-            else:
-                self.step()
-
+    def _allocated(self, work: Callable[[], Any]) -> int:
         if self.device.type != "cuda":
-            return peak_bytes(whole)
+            return peak_bytes(work)
         torch.cuda.reset_peak_memory_stats(self.device)
-        whole()
+        work()
         return torch.cuda.max_memory_allocated(self.device)
 
     def _now(self) -> float:

@@ -19,6 +19,7 @@ from training.cli.options import (
     Settings,
     Threads,
     build_scenario,
+    require_device,
     require_seed,
     workers_of,
 )
@@ -45,6 +46,9 @@ def evaluate(
     seed: Seed = 0,
     settings: Settings = None,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw figures.")] = True,
+    vector: Annotated[
+        bool, typer.Option("--vector", help="Draw them as SVG, in place of PNG.")
+    ] = False,
     report: Annotated[
         bool, typer.Option("--report", help="Write report.html, too: see **coloc report**.")
     ] = False,
@@ -79,7 +83,6 @@ def evaluate(
     from coloc_env.staging import staged_folder
 
     built = build_scenario(scenario, settings, threads, data)
-    from training.devices import checked_device
     from training.evaluation import files
     from training.evaluation.evaluate import evaluate as run
     from training.evaluation.evaluate import split_agents
@@ -89,9 +92,7 @@ def evaluate(
 
         plotly_script()  # what is not installed is said before anything runs
     names = split_agents(agents)
-    checked_device(device)
-    if device != "cpu" and (jobs > 1 or ray is not None):
-        raise ValueError(f"--device {device}: one process uses it, not those of --jobs or --ray")
+    require_device(device, jobs, ray)
     drawn = True
     with staged_folder(out, files.NAMES) as folder:
         with workers_of(jobs, ray) as workers, progress() as bars:
@@ -102,7 +103,7 @@ def evaluate(
         if report:
             drawn = _drawn("report", partial(files.write_report, found, out.name, folder))
         if figures:
-            drawn = _drawn("figures", partial(files.write_figures, found, folder)) and drawn
+            drawn = _drawn("figures", partial(files.write_figures, found, folder, vector)) and drawn
     typer.echo(f"written to {out}")
     if found.errors or not drawn:
         raise typer.Exit(1)

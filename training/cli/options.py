@@ -75,6 +75,15 @@ def workers_of(jobs: int, ray: str | None) -> Iterator["Workers"]:
         yield workers
 
 
+def require_device(device: str, jobs: int, ray: str | None) -> None:
+    """Raise ValueError for a device that is not there, or that several processes would share."""
+    from training.devices import checked_device
+
+    checked_device(device)
+    if device != "cpu" and (jobs > 1 or ray is not None):
+        raise ValueError(f"--device {device}: one process uses it, not those of --jobs or --ray")
+
+
 def require_seed(seed: int) -> None:
     """Raise ValueError for a seed that is none."""
     if not 0 <= seed < 2**62:

@@ -1,6 +1,8 @@
 """What commands print on a terminal: tables, explanations and bars of progress."""
 
 import inspect
+import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -57,17 +59,24 @@ def show(header: list[str], lines: list[list[str]]) -> None:
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Bars on stderr, where that is a terminal. The block is given a function to call with a task's
-    name, how much of it is done, and of how much; each task has a bar of its own."""
+    """Bars on stderr, where that is a terminal, or in a notebook's cell (by ipywidgets); in CI (the
+    variable ``CI`` is set) a line for each task that is done. The block is given a function to call
+    with a task's name, how much of it is done, and of how much; each task has a bar of its own."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    hidden = not console.is_terminal
+    hidden = not (console.is_terminal or console.is_jupyter)
+    in_lines = hidden and bool(os.environ.get("CI"))
+    start = time.monotonic()
     with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
         tasks: dict[str, Any] = {}
+        said: set[str] = set()
 
         def advance(what: str, done: int, total: int) -> None:
             if what not in tasks:
                 tasks[what] = bars.add_task(escape(what), total=total)
             bars.update(tasks[what], completed=done, total=total)
+            if in_lines and done >= total and what not in said:
+                said.add(what)
+                typer.echo(f"{what}: {total} done, {time.monotonic() - start:.1f} s", err=True)
 
         yield advance

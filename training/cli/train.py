@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from training.cli.options import Jobs, Ray, workers_of
+from training.cli.options import Device, Jobs, Ray, require_device, workers_of
 from training.cli.terminal import explain, progress, show
 from training.threads import use_threads
 
@@ -41,6 +41,7 @@ def train(
     threads: Annotated[
         int, typer.Option(help="CPU threads of torch; a run that continues keeps its own.")
     ] = 1,
+    device: Device = "cpu",
     jobs: Jobs = 1,
     ray: Ray = None,
 ) -> None:
@@ -69,6 +70,8 @@ def train(
 
     coloc train nnhpff --out runs/detector --ray auto
 
+    coloc train trust --out runs/trust --device cuda
+
     tensorboard --logdir runs
     """
     use_threads(threads)
@@ -77,13 +80,14 @@ def train(
     from training.learning.registry import TRAININGS
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every buffer it makes
+    require_device(device, jobs, ray)
     chosen: dict[str, Any] = {}
     if config is not None:
         if name is not None or out is None:
             raise ValueError("--config FILE says what to train, and --out DIR is needed")
         name, chosen = run.recipe(config)
     if resume is not None:
-        if name is not None or out is not None or settings:
+        if name is not None or out is not None or settings or device != "cpu":
             raise ValueError("--resume goes alone: a run continues as it was started")
         with workers_of(jobs, ray) as workers, progress() as bars:
             weights = run.resume(resume, bars, workers)
@@ -100,5 +104,5 @@ def train(
         known = TRAININGS.options_of(name)
         chosen |= parse_all(name, settings or (), known)
         with workers_of(jobs, ray) as workers, progress() as bars:
-            weights = run.start(name, chosen, out, bars, workers)
+            weights = run.start(name, chosen, out, bars, workers, device)
     typer.echo(f"weights written to {weights}")

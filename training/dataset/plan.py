@@ -54,6 +54,8 @@ class Plan:
         if not 1 <= self.steps <= horizon:
             name = self.scenario.name
             raise ValueError(f"--steps {self.steps} is not allowed: 1 to {horizon} for {name}")
+        if (links := self.scenario.network.links) != "all":
+            raise ValueError(f"links={links} is not allowed: nobody chooses them in a dataset")
 
     @cached_property
     def columns(self) -> tuple[Column, ...]:
@@ -64,6 +66,10 @@ class Plan:
         flag = Leaf(1, 0.0, 1.0)
         found = [Column(("truth", name), leaf, torch.float64) for name, leaf in truth.items()]
         found += [Column((name,), flag, torch.bool) for name in ("alive", "scored")]
+        if self.scenario.motion.steered:
+            slow = self.scenario.overrides.get("control", "velocity") == "velocity"
+            command = Leaf(dim, unit="m/s" if slow else "m/s²", frame="world")
+            found.append(Column(("command",), command))
         if self.agent is not None:
             own = own | message_leaves(self.scenario)
             unit = "position m, velocity m/s, log of the standard deviation in m"

@@ -13,10 +13,12 @@ from torch import Tensor
 
 from agents.localizer import Localizer
 from agents.registry import make
+from coloc_env.commands import Commands
 from coloc_env.json_files import read_json
 from coloc_env.rewards import reward
 from coloc_env.staging import locked, remove_leftovers, staged_file, staged_folder
 from training.dataset.card import card
+from training.dataset.commands import random_commands
 from training.dataset.parquet import require_pyarrow, write_steps, write_worlds
 from training.dataset.plan import Plan
 from training.evaluation.rollout import Breakdown, Step, rollout
@@ -139,7 +141,7 @@ def _run(plan: Plan, localizer: Localizer | None, seeds: Tensor, folder: Path) -
     whole["seed"].copy_(seeds)
     steps, worlds = whole["steps"], whole["worlds"]
     for step in _rollout(plan, localizer, seeds):
-        for keys, value in _of_step(plan, step).items():
+        for keys, value in _of_step(plan, step, seeds).items():
             steps.get(keys)[:, step.k].copy_(value)
         if step.k == 0:
             for key, value in step.world.static.items():
@@ -148,14 +150,19 @@ def _run(plan: Plan, localizer: Localizer | None, seeds: Tensor, folder: Path) -
 
 def _rollout(plan: Plan, localizer: Localizer | None, seeds: Tensor) -> Iterator[Step]:
     """Steps; ValueError where the agent breaks down."""
+
+    def following(k: int) -> Commands:
+        return Commands(motion=random_commands(plan.scenario, seeds, k))
+
+    commands = following if plan.scenario.motion.steered else None
     try:
-        yield from rollout(localizer, plan.scenario, seeds, plan.steps)
+        yield from rollout(localizer, plan.scenario, seeds, plan.steps, commands=commands)
     except Breakdown as breakdown:
         which = f"seeds {int(seeds[0])} to {int(seeds[-1])}"
         raise ValueError(f"{plan.agent}: {breakdown} (in the runs of {which})") from breakdown
 
 
-def _of_step(plan: Plan, step: Step) -> dict[tuple[str, ...], Tensor]:
+def _of_step(plan: Plan, step: Step, seeds: Tensor) -> dict[tuple[str, ...], Tensor]:
     """All columns of a step, [R, N, …] each."""
     world, truth = step.world, step.world.truth
     found = {
@@ -165,6 +172,8 @@ def _of_step(plan: Plan, step: Step) -> dict[tuple[str, ...], Tensor]:
         ("alive",): world.alive,
         ("scored",): world.now.scored,
     }
+    if plan.scenario.motion.steered:
+        found["command",] = random_commands(plan.scenario, seeds, step.k)
     if plan.agent is not None:
         error, scored = world.score(step.action)
         kind, target = plan.scenario.reward, world.now.target

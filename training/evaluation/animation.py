@@ -20,10 +20,12 @@ def frames(
     every: int,
     progress: Callable[[int], None],
     device: str | torch.device = "cpu",
+    scale: float = 1.0,
 ) -> Iterator[NDArray[np.uint8]]:
     """Pictures [H, W, 3] of a run's first ``steps`` steps, of every ``every``-th one;
-    ``progress(steps_done)`` is called as steps are done. The localizer is on ``device``."""
-    renderer = Renderer(scenario)
+    ``progress(steps_done)`` is called as steps are done. The localizer is on ``device``;
+    pictures have ``scale`` times the renderer's own size."""
+    renderer = Renderer(scenario, scale)
     for step in rollout(localizer, scenario, torch.tensor([seed]), steps, device=device):
         renderer.record(step.world, step.action)
         if (step.k + 1) % every == 0:

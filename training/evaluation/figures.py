@@ -48,8 +48,8 @@ _SHOWN = 100.0  # s of a run that a picture of trajectories shows at most
 _IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
 
 
-def draw(results: Evaluation, folder: Path) -> None:
-    """Write all figures into a folder."""
+def draw(results: Evaluation, folder: Path, names: Sequence[str] = FIGURES) -> None:
+    """Write all figures into a folder, by ``names`` whose endings say in which format."""
     drawings: Sequence[Callable[[Evaluation], Figure]] = (
         error_over_time,
         error_distribution,
@@ -57,7 +57,7 @@ def draw(results: Evaluation, folder: Path) -> None:
         consistency,
         trajectories,
     )
-    for name, drawing in zip(FIGURES, drawings, strict=True):
+    for name, drawing in zip(names, drawings, strict=True):
         with mpl.rc_context(STYLE):
             figure = drawing(results)
             # A legend may be wider than the figure: grow the page, never crop it.

@@ -10,9 +10,10 @@ from training.evaluation.tables import csv_text, markdown
 from training.evaluation.tum import write_tum
 
 FIGURES = ("error_over_time.png", "cdf.png", "boxes.png", "nees.png", "trajectories.png")
+VECTORS = tuple(name.replace(".png", ".svg") for name in FIGURES)
 REPORT = "report.html"
 WRITTEN = ("results.csv", "table.md", *FIGURES, "tum", runs.FILE, "results.json")
-NAMES = (REPORT, *WRITTEN)  # all that may be there; the last marks a whole folder
+NAMES = (REPORT, *VECTORS, *WRITTEN)  # all that may be there; the last marks a whole folder
 
 
 def write(results: Evaluation, folder: Path) -> None:
@@ -34,13 +35,14 @@ def write_report(results: Evaluation, name: str, folder: Path) -> None:
         file.write_text(text, encoding="utf-8")
 
 
-def write_figures(results: Evaluation, folder: Path) -> None:
-    """Draw all figures into the folder, or none if that raises."""
+def write_figures(results: Evaluation, folder: Path, vector: bool = False) -> None:
+    """Draw all figures into the folder as PNG or, ``vector``, SVG; none if that raises."""
+    names = VECTORS if vector else FIGURES
     try:
         from training.evaluation.figures import draw
 
-        draw(results, folder)
+        draw(results, folder, names)
     except BaseException:
-        for name in FIGURES:
+        for name in names:
             (folder / name).unlink(missing_ok=True)
         raise

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 from agents.localizer import Localizer
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
+from training.evaluation import metrics
 from training.evaluation.metrics import Flags, Floats
 from training.evaluation.rollout import Breakdown, Step, rollout
 from training.evaluation.team import team_figures
@@ -89,6 +91,21 @@ class RunRecord:
     ms_per_step: float | None = None
     covariance: Floats | None = None
     attitude: Floats | None = None
+
+    def _repr_html_(self) -> str:
+        """What there is, in notebooks."""
+        runs, steps, uavs = self.error.shape
+        scored = self.worlds.scored
+        rows = {
+            "runs, steps, UAVs": f"{runs}, {steps}, {uavs}",
+            "seeds": f"{self.worlds.seed} … {self.worlds.seed + runs - 1}",
+            "RMSE": f"{metrics.rmse(self.error, scored):.3g} m",
+            "mean NEES": f"{metrics.mean(self.nees[scored]):.3g}",
+            "broken runs": f"{int(self.broken.sum())}",
+            "series": escape(", ".join(self.series)) or "none",
+        }
+        cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items())
+        return f"<table><caption>RunRecord</caption>{cells}</table>"
 
     def to_arrays(self) -> tuple[Arrays, Facts]:
         """The agent's own arrays, and facts that JSON can hold; the worlds are not among them."""

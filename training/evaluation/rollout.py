@@ -1,7 +1,7 @@
 """The rollout: a localizer in its worlds, step by step. Everything that runs localizers uses it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from agents.localizer import Estimate, Localizer, finite_action
+from coloc_env.commands import Commands
 from coloc_env.observation import Observation, prior_action
 from coloc_env.scenario import Scenario
 from coloc_env.world import World
@@ -55,6 +56,7 @@ def rollout(
     stop: int | None = None,
     device: str | torch.device = "cpu",
     timed: bool = False,
+    commands: Callable[[int], Commands] | None = None,
 ) -> Iterator[Step]:
     """A localizer's steps in the worlds of ``seeds``: ``steps`` of them (default: the horizon).
     Without one nobody estimates, and the action is what the prior says.
@@ -62,7 +64,8 @@ def rollout(
     The world moves on when the next step is asked for. From step ``stop`` on the localizer is not
     asked any more, and its last action stands. Worlds are on ``device``, where the localizer must
     be (``localizer.to``); ``timed``: wait for the device, so that ``seconds`` are those of the
-    step. Raises Breakdown for a numerical error.
+    step; ``commands(k)``: what the team commands for the step k → k + 1. Raises Breakdown
+    for a numerical error.
     """
     world = World(scenario, len(seeds), device)
     observation = world.reset(seeds)
@@ -87,5 +90,5 @@ def rollout(
             estimate, finite = None, torch.ones_like(finite)
         yield Step(k, world, observation, belief, estimate, action, finite, seconds)
         if k + 1 < horizon:
-            world.advance(action)
+            world.advance(action, None if commands is None else commands(k))
             observation = world.observation()

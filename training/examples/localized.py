@@ -31,7 +31,7 @@ from agents.wrappers import adapters
 from agents.wrappers.localized_vmas import localized_vmas
 
 SEEN, ACTION, VALUE = ("agents", "observation"), ("agents", "action"), ("agents", "state_value")
-HORIZON = 100
+HORIZON, ROLLOUT = 100, 25  # steps of an episode, and of it that are learnt from at a time
 SETTINGS = {"navigation": {"n_agents": 3, "collisions": True}, "flocking": {"n_agents": 4}}
 QUALITIES: dict[str, dict[str, Any] | None] = {
     "truth": None,
@@ -73,7 +73,9 @@ def actor_of(env: EnvBase) -> ProbabilisticActor:
     )
 
 
-def trained(task: str, quality: str, steps: int, seed: int, worlds: int = 60) -> ProbabilisticActor:
+def trained(
+    task: str, quality: str, steps: int, seed: int, worlds: int = 240
+) -> ProbabilisticActor:
     """A policy after ``steps`` agent-steps of IPPO."""
     torch.manual_seed(seed)
     env = environment(task, quality, worlds, seed)
@@ -91,7 +93,7 @@ def trained(task: str, quality: str, steps: int, seed: int, worlds: int = 60) ->
     )
     loss.make_value_estimator(gamma=0.95, lmbda=0.9)
     optimizer = torch.optim.Adam(loss.parameters(), 7e-4)
-    rows = worlds * HORIZON
+    rows = worlds * ROLLOUT
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(rows), sampler=SamplerWithoutReplacement(), batch_size=rows // 8
     )

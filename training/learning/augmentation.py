@@ -20,9 +20,9 @@ class SwarmAugmentation(Transform):
     step; both ends of a link get the same. All is drawn from ``seed``.
     """
 
-    def __init__(self, std: float, seed: int) -> None:
+    def __init__(self, std: float, seed: int, device: str = "cpu") -> None:
         super().__init__(in_keys=[_SEEN], out_keys=[_SEEN])
-        self.std = std
+        self.std, self.where = std, device
         self.generator = torch.Generator().manual_seed(seed)
 
     def _reset(
@@ -68,7 +68,7 @@ class SwarmAugmentation(Transform):
         return pairs
 
     def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator)
+        return torch.rand(*shape, generator=self.generator).to(self.where)
 
     def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator)
+        return torch.randn(*shape, generator=self.generator).to(self.where)

@@ -106,8 +106,9 @@ def samples(
     seen = batch["uav", "observation"]
     observed = Observation({k: seen[k].flatten(0, 1) for k in all_leaves(scenario)})
     u = process.inputs(observed).unflatten(0, batch.shape)
-    starts = torch.arange(0, batch.shape[1] - steps + 1, EVERY)
-    at = starts.unsqueeze(-1) + torch.arange(steps)
+    device = truth.device
+    starts = torch.arange(0, batch.shape[1] - steps + 1, EVERY, device=device)
+    at = starts.unsqueeze(-1) + torch.arange(steps, device=device)
     truth, u = (x[:, at].movedim(2, -2).flatten(0, 2).double() for x in (truth, u))
     truth, u = (x.repeat(DRAWS, 1, 1) for x in (truth, u))  # [R, steps, S]
     g = torch.Generator().manual_seed(seed)
@@ -115,14 +116,15 @@ def samples(
 
     def scale(bounds: tuple[float, float]) -> Tensor:
         low, high = torch.tensor(bounds, dtype=torch.float64).log()
-        return (low + (high - low) * torch.rand(rows, 1, generator=g, dtype=torch.float64)).exp()
+        drawn = torch.rand(rows, 1, generator=g, dtype=torch.float64)
+        return (low + (high - low) * drawn).exp().to(device)
 
     position = scale(POSITION)
     velocity = scale(VELOCITY) * position / length
     turn = (scale(ATTITUDE) * position / (_GRAVITY * length**2)).clamp_max(_MOST)
     delta = torch.cat([s.expand(-1, 3) for s in (position, velocity, turn)], -1)
-    delta = delta * torch.randn(rows, 9, generator=g, dtype=torch.float64)
-    dt = torch.full((rows,), process.dt, dtype=torch.float64)
+    delta = delta * torch.randn(rows, 9, generator=g, dtype=torch.float64).to(device)
+    dt = truth.new_full((rows,), process.dt)
     x, errors = process.boxplus(truth[:, 0], delta), []
     for k in range(steps):
         x = process.propagate(x, u[:, k], dt) if k else x
@@ -133,13 +135,14 @@ def samples(
     entries = {
         "errors": torch.stack(errors, 1),
         "scale": torch.cat((one.expand(-1, 3), pace.expand(-1, 3)), -1),
-        "normal": torch.randn(rows, latents, generator=g, dtype=torch.float64),
+        "normal": torch.randn(rows, latents, generator=g, dtype=torch.float64).to(device),
     }
     kept = (state[..., -1] > 0).all(1).unsqueeze(1).expand(-1, len(starts), -1).flatten()
     return TensorDict({k: v.float() for k, v in entries.items()}, (rows,))[kept.repeat(DRAWS)]
 
 
 def dlspf(
+    device: str = "cpu",
     *,
     scenario: str = "indoor-v0:motion=random:horizon=100",
     worlds: Worlds = 8,
@@ -164,18 +167,18 @@ def dlspf(
         raise ValueError(
             f"dlspf: a horizon of {parsed.horizon} steps is too short: {WINDOW + AHEAD} at least"
         )
-    localizer: Any = make("dlspf", parsed, weights="none", seed=seed)
+    localizer: Any = make("dlspf", parsed, weights="none", seed=seed).to(device)
     if localizer.process.state_size != UNBIASED:
         raise ValueError(f"dlspf: {scenario}: a scenario with an IMU without biases is needed")
     model: LatentModel = localizer.model
-    still: Any = make("dead_reckoning", parsed)
+    still: Any = make("dead_reckoning", parsed).to(device)
     loss = LatentLoss(model, mmd)
     starts = len(range(0, parsed.horizon - WINDOW - AHEAD + 1, EVERY))
 
     def collect(epoch: int) -> Any:
         for group in trainer.optimizer.param_groups:
             group["lr"] = learning_rate * (1 - 0.98 * epoch / max(1, epochs - 1))
-        env = CoLocEnv(parsed, worlds, seed=world_seed(seed, epoch, worlds))
+        env = CoLocEnv(parsed, worlds, device, seed=world_seed(seed, epoch, worlds))
         policy = LocalizerPolicy(still, parsed)
         return episode_collector(env, policy, parsed.horizon, compact_obs=True)
 
@@ -195,6 +198,7 @@ def dlspf(
         minibatch=minibatch,
         passes=passes,
         seed=seed,
+        device=device,
     )
     return Training(model, collector, trainer, partial(score, localizer, parsed, score_runs))
 
@@ -210,7 +214,7 @@ def score(localizer: Any, scenario: Scenario, runs: int, progress: Progress) -> 
     if runs == 0:
         return {}
     found: dict[str, Any] = {"runs": runs, "seeds": [0, runs - 1]}
-    for name, one in (("pf500", make("pf500", scenario)), ("dlspf", localizer)):
+    for name, one in (("pf500", make("pf500", scenario)), ("dlspf", localizer.to("cpu"))):
         result = record(one, scenario, torch.arange(runs))
         found[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
         progress("scoring", len(found) - 2, 2)

@@ -27,6 +27,7 @@ class Episode:
     seed: int
     policy: TensorDictModuleBase
     size: int = 1
+    device: str = "cpu"
 
     def settings(self) -> dict[str, Any]:
         """What the result depends on beside scenario and policy, which are sent."""
@@ -36,7 +37,7 @@ class Episode:
 
     def run(self, progress: Callable[[int], None]) -> TensorDict:
         """The episode as one batch [worlds, horizon]."""
-        env = CoLocEnv(self.scenario, self.worlds, seed=self.seed)
+        env = CoLocEnv(self.scenario, self.worlds, self.device, seed=self.seed)
         collector = episode_collector(env, self.policy, self.scenario.horizon, compact_obs=True)
         (batch,) = (batch.to_tensordict() for batch in collector)
         collector.shutdown()

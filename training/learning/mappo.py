@@ -21,6 +21,7 @@ from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.trainers import ReplayBufferTrainer
 
 from agents import make
+from agents.parts import move
 from agents.policies.actor import Actor, Body
 from agents.policies.learned import PolicyAgent, actor_for, inputs_of, mode_of
 from agents.weights import drawn_from
@@ -55,12 +56,18 @@ _MEMORY = ("hidden", "cell")
 
 
 def environment(
-    scenario: Scenario, worlds: int, seed: int, base: str, feedback: float
+    scenario: Scenario,
+    worlds: int,
+    seed: int,
+    base: str,
+    feedback: float,
+    device: str = "cpu",
 ) -> PerUavEnv:
     """``worlds`` worlds seen by each UAV for itself: corrections on a base's estimates, or, with
     ``base=none``, displacements of the UAV's own."""
     mode = learners_mode(scenario.believed, base, feedback)
-    return PerUavEnv(CoLocEnv(scenario, worlds, seed=seed, action=mode))
+    move(mode, device)
+    return PerUavEnv(CoLocEnv(scenario, worlds, device, seed=seed, action=mode))
 
 
 def policy_of(actor: Actor) -> ProbabilisticActor:
@@ -98,6 +105,7 @@ def _ppo(
     name: str,
     loss_class: type[MAPPOLoss],
     reads: Sequence[str],
+    device: str = "cpu",
     *,
     scenario: str = "indoor-v0:motion=random:horizon=200",
     variants: str = "",
@@ -128,7 +136,7 @@ def _ppo(
 
     def environments(first: int, each: int = share) -> list[PerUavEnv]:
         return [
-            environment(one, each, first + i * each, base, feedback)
+            environment(one, each, first + i * each, base, feedback, device)
             for i, one in enumerate(scenarios)
         ]
 
@@ -141,9 +149,9 @@ def _ppo(
         )
     samples = _random_steps(environments(world_seed(seed, epochs, worlds), min(share, 16)), seed)
     with drawn_from(seed):
-        actor = actor_for(ones[0].mode, hidden=hidden, recurrent=recurrent)
+        actor = actor_for(ones[0].mode, hidden=hidden, recurrent=recurrent).to(device)
         read = torch.cat([samples[key] for key in reads], -1)
-        critic = Critic(read.shape[-1], hidden)
+        critic = Critic(read.shape[-1], hidden).to(device)
         actor.body.normal.fit(samples["observation"])
         critic.body.normal.fit(read)
     policy = policy_of(actor)
@@ -171,7 +179,7 @@ def _ppo(
     collector = EpochCollector(collect, epochs)
     rows = worlds * scenarios[0].arena.n_uavs
     buffer = ReplayBuffer(  # of rows, each with its steps in order, as an LSTM needs them
-        storage=LazyTensorStorage(rows),
+        storage=LazyTensorStorage(rows, device=device),
         sampler=SamplerWithoutReplacement(),
         batch_size=-(-rows // minibatches),
     )
@@ -196,7 +204,7 @@ def _ppo(
 
 
 @wraps(_ppo, assigned=())
-def mappo(**options: Any) -> Training:
+def mappo(device: str = "cpu", **options: Any) -> Training:
     """A policy for every UAV, with a critic that sees the team's truth (MAPPO, Yu et al. 2022).
 
     It corrects the estimates of a ``base`` localizer, or, with ``base=none``, localizes alone.
@@ -206,16 +214,16 @@ def mappo(**options: Any) -> Training:
     that are not fed back (``feedback``): each is a bandit's. The learning rate falls linearly. At
     the end the policy meets its base and a Huber EKF in ``score_runs`` held-out worlds.
     """
-    return _ppo("mappo", MAPPOLoss, ("observation", "state"), **options)
+    return _ppo("mappo", MAPPOLoss, ("observation", "state"), device, **options)
 
 
 @wraps(_ppo, assigned=())
-def ippo(**options: Any) -> Training:
+def ippo(device: str = "cpu", **options: Any) -> Training:
     """A policy for every UAV, with a critic of its own observation (IPPO, de Witt et al. 2020).
 
     Options as ``coloc train mappo`` has them.
     """
-    return _ppo("ippo", IPPOLoss, ("observation",), **options)
+    return _ppo("ippo", IPPOLoss, ("observation",), device, **options)
 
 
 def _random_steps(envs: Sequence[PerUavEnv], seed: int) -> TensorDictBase:

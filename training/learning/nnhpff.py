@@ -15,6 +15,7 @@ from agents import make
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import FailureDetector, evidence, network_features
+from agents.parts import move
 from agents.policies.adapters import LocalizerPolicy
 from agents.weights import untrained
 from coloc_env.observation import Observation, all_leaves
@@ -64,11 +65,12 @@ class Samples:
     the estimate, whether it has ``failed``, its ``error`` (m) and whether that is ``scored``
     [B, N]."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, device: str = "cpu") -> None:
         sensor = scenario.believed.sensor(AnchorRanging)
         if sensor is None or sensor.tags:
             raise ValueError(f"nnhpff: {scenario.name} has no anchors, or lever arms to them")
         self.model, self.process = AnchorRanges(sensor), make_process(scenario.believed)
+        move([self.model, self.process], device)
         self.leaves, self.n_uavs = tuple(all_leaves(scenario)), scenario.arena.n_uavs
 
     def __call__(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
@@ -104,6 +106,7 @@ def _anchors(scenario: Scenario) -> int:
 
 
 def nnhpff(
+    device: str = "cpu",
     *,
     scenario: str = "wsn-v0",
     variants: str = VARIANTS,
@@ -132,17 +135,17 @@ def nnhpff(
             "anchors"
         )
     filters = [
-        (LocalizerPolicy(make(main, one), one, record=Samples(one)), one)
+        (LocalizerPolicy(make(main, one).to(device), one, record=Samples(one, device)), one)
         for one in scenarios
         for main in mains.split("/")
     ]
-    detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed), kinds
+    detector, ((steps, n_uavs, _),) = untrained(FailureDetector, seed).to(device), kinds
 
     def collect(epoch: int) -> Episodes:
         first = world_seed(seed, epoch, worlds * len(filters))
         return Episodes(
             [
-                Episode(one, worlds, first + i * worlds, policy)
+                Episode(one, worlds, first + i * worlds, policy, device=device)
                 for i, (policy, one) in enumerate(filters)
             ]
         )
@@ -159,6 +162,7 @@ def nnhpff(
         minibatch=minibatch,
         passes=passes,
         seed=seed,
+        device=device,
     )
     return Training(
         module=detector,

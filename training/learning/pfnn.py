@@ -122,6 +122,7 @@ class InTurn:
 
 
 def pfnn(
+    device: str = "cpu",
     *,
     mode: Literal["offline", "online"] = "offline",
     scenario: str = "indoor-v0",
@@ -148,13 +149,13 @@ def pfnn(
         raise ValueError(
             f"pfnn: a horizon of {parsed.horizon} steps is too short: {EVERY} at least"
         )
-    localizer: Any = make("pfnn", parsed, weights="none", seed=seed)
+    localizer: Any = make("pfnn", parsed, weights="none", seed=seed).to(device)
     loss = CorrectorLoss(localizer.corrector)
     steps = EVERY if mode == "online" else parsed.horizon // EVERY * EVERY
 
     def collect(epoch: int) -> Batches:
         policy = LocalizerPolicy(localizer, parsed, record=Samples(parsed))
-        env = CoLocEnv(parsed, worlds, seed=world_seed(seed, epoch, worlds))
+        env = CoLocEnv(parsed, worlds, device, seed=world_seed(seed, epoch, worlds))
         return episode_collector(env, policy, steps, compact_obs=True)
 
     collector = EpochCollector(collect, epochs)
@@ -171,6 +172,7 @@ def pfnn(
             minibatch=minibatch,
             passes=passes,
             seed=seed,
+            device=device,
         )
     trainer.register_op("pre_steps_log", _figures)
     return Training(
@@ -217,7 +219,7 @@ def score(localizer: Any, scenario: Scenario, runs: int, progress: Progress) -> 
     if runs == 0:
         return {}
     plain, records = make("apf", scenario, seed=localizer.seed), {}
-    for name, one in (("apf", plain), ("pfnn", localizer)):
+    for name, one in (("apf", plain), ("pfnn", localizer.to("cpu"))):
         done = 0
 
         def tick(steps: int, name: str = name) -> None:

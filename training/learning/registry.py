@@ -17,7 +17,7 @@ TRAININGS = Registry(
         "task-qmix": "training.learning.tasks.qmix:task_qmix",
         "task-sb3-ppo": "training.learning.tasks.sb3:task_sb3_ppo",
         "stdcl": "training.learning.stdcl:stdcl",
-        "stdcl_factors": "training.learning.stdcl_factors:stdcl_factors",
+        "stdcl_loop": "training.learning.stdcl_loop:stdcl_loop",
         "trust": "training.learning.trust:trust",
     },
 )

@@ -25,12 +25,13 @@ def replay_buffer_trainer(
     minibatch: int,
     passes: int,
     seed: int,
+    device: str = "cpu",
 ) -> Trainer:
     """Adam on minibatches of each epoch's ``samples`` (at most ``capacity`` rows), in an order
     drawn from (seed, epoch). Worlds are always new ones, so ``held_out``'s figures of the rows
     before they are trained on, which are logged, are those of held-out rows."""
     buffer = ReplayBuffer(
-        storage=LazyTensorStorage(capacity),
+        storage=LazyTensorStorage(capacity, device=device),
         sampler=SamplerWithoutReplacement(),
         batch_size=minibatch,
     )

@@ -6,6 +6,7 @@
 - NAME.safetensors, NAME.json: the trained weights and their card, once it is
 """
 
+import inspect
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -26,6 +27,7 @@ from coloc_env import options, state_file
 from coloc_env.json_files import read_json
 from coloc_env.options import Quantity, typed
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
+from training.devices import checked_device
 from training.learning import curves
 from training.learning.collectors import EpochCollector
 from training.learning.logger import RunLogger
@@ -41,7 +43,7 @@ _FIELDS = {
     "command": str,
     "threads": Annotated[int, Quantity("", 1, 1 << 12)],
 }
-_OPTIONAL = {"versions": dict[str, str]}
+_OPTIONAL = {"versions": dict[str, str], "device": str}
 _UNBOUNDED = 1 << 62  # frames: the epochs end a training, not a number of frames
 _VERSIONS = ("coloc-env", "torch", "torchrl", "tensordict", "safetensors", "numpy")
 
@@ -124,17 +126,20 @@ def start(
     out: Path,
     progress: Progress,
     workers: Workers = ALONE,
+    device: str = "cpu",
 ) -> Path:
     """Train from the beginning, in the folder ``out``; returns the weights' file. Rollouts are
-    spread over ``workers``. Raises ValueError for options that do not fit, a training that workers
-    cannot share, or a folder in use, before anything is written."""
+    spread over ``workers``; worlds, networks and losses are on ``device``. Raises ValueError for
+    options that do not fit, a training that workers cannot share or that knows no other device than
+    the CPU, or a folder in use, before anything is written."""
     chosen = options.checked(name, chosen, TRAININGS.options_of(name))
     _require_new(out)
-    training = _spread(name, _built(name, chosen), workers)
+    training = _spread(name, _built(name, chosen, device), workers)
     config = {
         "training": name,
         "options": dict(chosen),
-        "command": _command(name, chosen, out),
+        "command": _command(name, chosen, out, device),
+        **({} if device == "cpu" else {"device": device}),
         "threads": torch.get_num_threads(),
         "versions": _versions(),
     }
@@ -179,7 +184,12 @@ def resume(folder: Path, progress: Progress, workers: Workers = ALONE) -> Path:
         remove_leftovers(folder)
         use_threads(config["threads"], f"{folder / _CONFIG}: threads")
         name = config["training"]
-        training = _spread(name, _built(name, config["options"]), workers)
+        device = config.get("device", "cpu")
+        try:
+            checked_device(device)
+        except ValueError as error:
+            raise ValueError(f"{folder / _CONFIG}: {error}") from None
+        training = _spread(name, _built(name, config["options"], device), workers)
         return _train(folder, config, training, progress)
 
 
@@ -200,6 +210,7 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
     collector.on_epoch_end = save
     trainer.train()
     logger.close()
+    training.module.to("cpu")  # where it is scored, whatever it was trained on
     _require_learned(name, training)
     defaults = {key: one.default for key, one in TRAININGS.options_of(name).items()}
     card = {
@@ -218,10 +229,12 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
     return weights
 
 
-def _built(name: str, chosen: Mapping[str, Any]) -> Training:
-    factory = TRAININGS[name]
+def _built(name: str, chosen: Mapping[str, Any], device: str) -> Training:
+    factory, where = TRAININGS[name], () if device == "cpu" else (device,)
+    if where and "device" not in inspect.signature(factory).parameters:
+        raise ValueError(f"{name} trains on the CPU: --device {device} is not for it")
     try:
-        training: Training = factory(**options.grouped(factory, chosen))
+        training: Training = factory(*where, **options.grouped(factory, chosen))
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise
@@ -306,10 +319,11 @@ def _config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def _command(name: str, chosen: Mapping[str, Any], out: Path) -> str:
+def _command(name: str, chosen: Mapping[str, Any], out: Path, device: str) -> str:
     """The command line that starts the same run."""
     settings = "".join(f" --set {key}={typed(value)}" for key, value in chosen.items())
-    return f"coloc train {name}{settings} --out {out}"
+    where = "" if device == "cpu" else f" --device {device}"
+    return f"coloc train {name}{settings}{where} --out {out}"
 
 
 def _versions() -> dict[str, str]:

@@ -22,7 +22,10 @@ def with_belief(
 ) -> dict[str, Any]:
     """What a ``LocalizerPolicy`` is to record: the belief that a step starts from, and which
     variant it is of."""
-    return {**flat(before), "variant": torch.full(before.batch_size[:1], variant)}
+    return {
+        **flat(before),
+        "variant": torch.full(before.batch_size[:1], variant, device=tensordict.device),
+    }
 
 
 def run_again(

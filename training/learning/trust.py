@@ -127,7 +127,7 @@ def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -
         "shared": before.shared,
         "step": before.step,
         "memory": before.memory,
-        "variant": torch.full(before.batch_size[:1], variant),
+        "variant": torch.full_like(before.step[:, 0], variant),
     }
 
 
@@ -138,6 +138,7 @@ def _belief(entries: TensorDictBase) -> GaussianBelief:
 
 
 def trust(
+    device: str = "cpu",
     *,
     scenario: str = "indoor-v0:horizon=100",
     start: str = "trust",
@@ -161,13 +162,15 @@ def trust(
     """
     scenarios = [parse_scenario(scenario, variant) for variant in VARIANTS]
     require_batches("trust", scenarios, steps)
-    network = _first(start, seed)
+    network = _first(start, seed).to(device)
     filters: list[Any] = [make("ekf_trust:bank=false:weights=none", one) for one in scenarios]
     banks: list[Any] = [make("ekf_trust:weights=none", one) for one in scenarios]
     for ekf, bank in zip(filters, banks, strict=True):
         ekf.learn(network)
         ekf.screen = Capped(ekf.screen)
         bank.learn(network)
+        ekf.to(device)
+        bank.to(device)
     loss = TrustLoss(network, filters, scenarios)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
@@ -179,7 +182,7 @@ def trust(
         collectors = []
         team = banks if epoch % 2 else filters
         for i, (one, localizer) in enumerate(zip(scenarios, team, strict=True)):
-            env = CoLocEnv(one, worlds, seed=first + i * worlds)
+            env = CoLocEnv(one, worlds, device, seed=first + i * worlds)
             policy = LocalizerPolicy(localizer, one, record=partial(_record, i))
             # ("next", "uav", "observation") is the next step's: half the memory.
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))

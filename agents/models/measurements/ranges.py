@@ -34,15 +34,19 @@ class _Ranges(Measurement):
         self, observation: Observation
     ) -> tuple[Float[Tensor, "B N F"], Bool[Tensor, "B N F"]]:
         """Distances (m), and where they were measured."""
-        z = observation[self.leaf].unsqueeze(-1)
-        z, mask = usable(z, observation[self.mask_leaf] > 0, ranges=True)
-        return z[..., 0], mask
+
+        def read() -> tuple[Tensor, Tensor]:
+            z = observation[self.leaf].unsqueeze(-1)
+            z, mask = usable(z, observation[self.mask_leaf] > 0, ranges=True)
+            return z[..., 0], mask
+
+        return observation.once(self, read)
 
     def _variance(self, distance: Float[Tensor, "B N T P"]) -> Float[Tensor, "B N T*P 1"]:
         """R of each range, at the distance that is expected."""
         flat = distance.flatten(-2).unsqueeze(-1)
         if not self.noise.per_metre:
-            return flat.new_tensor(self.variance).expand_as(flat)
+            return flat.new_full((), self.variance).expand_as(flat)
         return (noise_std(self.noise.std) + self.noise.per_metre * flat) ** 2
 
     def _block(
@@ -100,11 +104,15 @@ class AnchorRanges(_Ranges):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        anchors = observation["anchor_map"].to(x.dtype).unflatten(-1, (-1, process.dim))
-        shape = (self.n_tags, anchors.shape[-2])
-        z, there = self.read(observation)
-        ranges, mask = z.to(x.dtype).unflatten(-1, shape), there.unflatten(-1, shape)
-        return self._block(process, x, ranges, mask, anchors.unsqueeze(-3), derivatives)[0]
+        def by_tag() -> tuple[Tensor, Tensor, Tensor]:
+            anchors = observation["anchor_map"].to(x.dtype).unflatten(-1, (-1, process.dim))
+            shape = (self.n_tags, anchors.shape[-2])
+            z, there = self.read(observation)
+            ranges, mask = z.to(x.dtype).unflatten(-1, shape), there.unflatten(-1, shape)
+            return ranges, mask, anchors.unsqueeze(-3)
+
+        ranges, mask, anchors = observation.once((self, x.dtype), by_tag)
+        return self._block(process, x, ranges, mask, anchors, derivatives)[0]
 
 
 class UavRanges(_Ranges):
@@ -139,14 +147,24 @@ class UavRanges(_Ranges):
         t, s = self.n_tags, neighbours.known.shape[-1]
 
         def by_own_tag(leaf: Tensor) -> Tensor:  # [B, N, S·T·T] → [B, N, T, S·T]
+            if t == 1:
+                return leaf.unsqueeze(-2)
             return leaf.unflatten(-1, (s, t, t)).transpose(-3, -2).flatten(-2)
 
-        points = neighbours.position.repeat_interleave(t, -2).unsqueeze(-3)
-        known = neighbours.known.repeat_interleave(t, -1).unsqueeze(-2)
-        z, there = self.read(observation)
-        ranges, mask = by_own_tag(z.to(x.dtype)), by_own_tag(there) & known
+        def by_their_tag(each: Tensor, dim: int) -> Tensor:
+            return (each.contiguous() if t == 1 else each.repeat_interleave(t, dim)).unsqueeze(
+                dim - 1
+            )
+
+        def by_tag() -> tuple[Tensor, Tensor]:
+            z, there = self.read(observation)
+            return by_own_tag(z.to(x.dtype)), by_own_tag(there)
+
+        ranges, there = observation.once((self, x.dtype), by_tag)
+        mask = there & by_their_tag(neighbours.known, -1)
+        points = by_their_tag(neighbours.position, -2)
         block, unit = self._block(process, x, ranges, mask, points, derivatives)
-        variance = neighbours.variance.repeat_interleave(t, -2).unsqueeze(-3)
+        variance = by_their_tag(neighbours.variance, -2)
         added = (unit**2 * variance).sum(-1) + self.their_arms
         return Block(
             residual=block.residual,

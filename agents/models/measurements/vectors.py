@@ -36,7 +36,7 @@ class LandmarkVectors(Measurement):
     ) -> tuple[Float[Tensor, "B N m d"], Bool[Tensor, "B N m"]]:
         """What was measured (m), and where."""
         z = observation["landmarks"].unflatten(-1, (-1, dim))
-        return usable(z, observation["landmark_mask"] > 0)
+        return observation.once(self, lambda: usable(z, observation["landmark_mask"] > 0))
 
     def linearize(
         self,
@@ -49,9 +49,15 @@ class LandmarkVectors(Measurement):
         d = process.dim
         rotation, turn = body_frame(process, x, "landmark vectors are")
         z, mask = self.read(observation, d)
-        apart = observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)) - x[..., None, :d]
-        expected = apart @ rotation
-        residual = z.to(x.dtype) - expected
+        known, z = observation.once(
+            (self, x.dtype),
+            lambda: (
+                observation["landmark_map"].to(x.dtype).unflatten(-1, (-1, d)),
+                z.to(x.dtype),
+            ),
+        )
+        expected = (known - x[..., None, :d]) @ rotation
+        residual = z - expected
         jacobian = x.new_zeros(0)
         if derivatives:
             jacobian = x.new_zeros(*residual.shape, process.error_size)
@@ -63,7 +69,7 @@ class LandmarkVectors(Measurement):
         return Block(
             residual=residual,
             jacobian=jacobian,
-            variance=x.new_tensor(self.std**2).expand_as(residual),
+            variance=x.new_full((), self.std**2).expand_as(residual),
             mask=mask,
         )
 

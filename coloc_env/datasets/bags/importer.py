@@ -1,11 +1,12 @@
 """From a bag to a folder in the open format, message by message: a bag need not fit in memory."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
 import yaml
 
 from coloc_env.datasets.bags.messages import (
@@ -40,7 +41,8 @@ def import_bag(
     many rows each table has (``robot/table``).
 
     Stamps are those of the messages' headers unless the file says otherwise. Satellite fixes become
-    metres east, north and up of the first one.
+    metres east, north and up of the first one; what a receiver says is no fix is left out and
+    counted, like distances beyond a sensor's reach.
 
     Raises:
         DataError: no bag, a topic or field that is not in it, or a recording that is refused when
@@ -118,7 +120,9 @@ class _Tables:
             for entry in entries_of(message, topic.each, where):
                 if all(str(field_of(entry, k, where)) == v for k, v in topic.where.items()):
                     stamp = self._stamp(topic, entry, message, received, where)
-                    self._write(topic, stamp, self._cells(topic, connection, entry, where))
+                    cells = self._cells(topic, connection, entry, where)
+                    if topic.table != "truth" or _finite(cells):  # else a hole in the truth
+                        self._write(topic, stamp, cells)
 
     def close(self) -> dict[str, int]:
         """Close all files, each in the order of time."""
@@ -197,6 +201,10 @@ def _deserialized(reader: Any, raw: bytes, connection: Any) -> Any:
         raise DataError(
             f"{connection.topic}: a {connection.msgtype} that cannot be read: {text}"
         ) from None
+
+
+def _finite(cells: Mapping[str, Any]) -> bool:
+    return all(np.isfinite(value) for value in cells.values())
 
 
 def _cell(value: Any) -> str:

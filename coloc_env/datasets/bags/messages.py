@@ -20,6 +20,13 @@ class LocalOrigin:
     place: np.ndarray | None = None
     turn: np.ndarray | None = None
 
+    def of(self, fix: Any) -> dict[str, float]:
+        """East, north and up of a NavSatFix (degrees, m above the ellipsoid); NaN of one that the
+        receiver says is none, or is not finite."""
+        at = (fix.latitude, fix.longitude, fix.altitude)
+        known = fix.status.status >= 0 and np.isfinite(at).all()
+        return dict(zip("xyz", self.local(*at) if known else (np.nan,) * 3, strict=True))
+
     def local(self, latitude: float, longitude: float, altitude: float) -> tuple[float, ...]:
         """East, north and up of a fix (degrees, m above the ellipsoid)."""
         here = _earth_centred(latitude, longitude, altitude)
@@ -83,12 +90,19 @@ def _twist(message: Any) -> dict[str, float]:
     return {"vx": v.x, "vy": v.y, "wz": w.z}
 
 
+def _distance(message: Any) -> float:
+    """Of a Range; NaN beyond what its sensor can measure (REP 117)."""
+    least, most = message.min_range, message.max_range
+    beyond = message.range < least or 0 < most < message.range
+    return np.nan if beyond else message.range
+
+
 def _range(message: Any) -> dict[str, float]:
-    return {"range": message.range}
+    return {"range": _distance(message)}
 
 
 def _height(message: Any) -> dict[str, float]:
-    return {"height": message.range}
+    return {"height": _distance(message)}
 
 
 def _velocity(twist: Any) -> dict[str, float]:
@@ -131,9 +145,7 @@ PLACES = ("truth", "position_fix")
 def reader_of(table: str, kind: str, origin: LocalOrigin) -> Callable[[Any], Cells] | None:
     """What reads messages of a type for a table; None where the type says nothing of it."""
     if kind == FIX and table in PLACES:
-        return lambda m: dict(
-            zip("xyz", origin.local(m.latitude, m.longitude, m.altitude), strict=True)
-        )
+        return origin.of
     return KNOWN.get(table, {}).get(kind)
 
 

@@ -1,6 +1,6 @@
 """Fixed UWB anchors in a room."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from coloc_env.options import Count, Group, Metres, PositiveMetres, Share
@@ -46,7 +46,8 @@ class AnchorOptions(Group):
 class TdoaOptions(Group):
     """So many ``tdoa_anchors`` send in turn, placed as ``anchors`` are; UAVs only listen, and
     measure how much farther each is than the one before, with noise of ``tdoa_std`` m, where both
-    lie within ``tdoa_radius`` m (none: always). A share ``tdoa_dropout`` is missing."""
+    lie within ``tdoa_radius`` m (none: always). A share ``tdoa_dropout`` is missing; a share
+    ``tdoa_tail`` has noise of ``tdoa_tail_std`` m instead, which the team does not believe in."""
 
     title: ClassVar[str] = "time differences of arrival"
 
@@ -54,10 +55,17 @@ class TdoaOptions(Group):
     tdoa_std: Metres = 0.15
     tdoa_radius: PositiveMetres | None = None
     tdoa_dropout: Share = 0.0
+    tdoa_tail: Share = 0.0
+    tdoa_tail_std: Metres = 1.0
 
     def true(self, room: tuple[float, ...], tags: Tags = ()) -> tuple[Tdoa, ...]:
         """The sensor as it is, in a room with sides in m, at tags with lever arms; nothing without
         anchors."""
+        tail, wide = self.tdoa_tail, self.tdoa_tail_std
+        return tuple(replace(t, tail=tail, tail_std=wide) for t in self.believed(room, tags))
+
+    def believed(self, room: tuple[float, ...], tags: Tags = ()) -> tuple[Tdoa, ...]:
+        """The sensor that the team believes in."""
         if not self.tdoa_anchors:
             return ()
         if self.tdoa_anchors == 1:

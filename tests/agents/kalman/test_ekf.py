@@ -15,6 +15,7 @@ from coloc_env.bounds import posterior_bound
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
+from tests.sampling import crossed
 
 RUNS, STEPS = 10, 150
 
@@ -125,15 +126,18 @@ def test_dead_reckoning_drifts_honestly(tools: SimpleNamespace) -> None:
 # ---------------------------------------------------------------- robust
 
 
-@pytest.mark.parametrize("name", ["ekf", "ekf_joint"])
 @pytest.mark.parametrize(
-    ("trouble", "robust", "share"),
-    [
-        ({"nlos": 0.3}, "huber", 0.85),
-        ({"nlos": 0.3}, "gate", 0.8),
-        ({"false_matches": 0.1}, "huber", 0.2),
-        ({"false_matches": 0.1}, "gate", 0.4),
-    ],
+    ("name", "trouble", "robust", "share"),
+    crossed(
+        ["ekf", "ekf_joint"],
+        [
+            ({"nlos": 0.3}, "huber", 0.85),
+            ({"nlos": 0.3}, "gate", 0.8),
+            ({"false_matches": 0.1}, "huber", 0.2),
+            ({"false_matches": 0.1}, "gate", 0.4),
+        ],
+        every=2,
+    ),
     ids=str,
 )
 def test_robust_weights_help_in_trouble(

@@ -17,6 +17,7 @@ from agents.robust import Trust
 from coloc_env.bounds import posterior_bound
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
+from coloc_env.sensors import Tdoa
 from coloc_env.world import World
 
 RANGED: dict[str, Any] = {"landmarks": 0, "uwb": False}
@@ -158,6 +159,27 @@ def test_a_drift_that_is_estimated_beats_one_that_is_considered() -> None:
             seen = world.observation()
         errors.append(float(torch.stack(squared)[20:].mean().sqrt()))
     assert errors[1] < errors[0]
+
+
+def test_huber_withstands_time_differences_with_a_tail() -> None:
+    """Which the team does not believe in."""
+    scenario = make_scenario(
+        "indoor-v0", **RANGED, n_uavs=2, tdoa_anchors=8, tdoa_tail=0.2, tdoa_tail_std=2.0
+    )
+    (believed,) = (s for s in scenario.believed.sensors if isinstance(s, Tdoa))
+    assert believed.tail == 0
+    errors = {}
+    for agent in ("ekf", "ekf:robust=huber"):
+        world, localizer = World(scenario, 16), make(agent, scenario)
+        seen = world.reset(torch.arange(16))
+        belief, squared = localizer.reset(seen), []
+        for _ in range(20):
+            belief, estimate = localizer.step(belief, seen)
+            squared.append((estimate.position - world.truth.position).square().sum(-1))
+            world.advance(estimate.action())
+            seen = world.observation()
+        errors[agent] = float(torch.stack(squared)[8:].mean().sqrt())
+    assert errors["ekf:robust=huber"] < 0.5 * errors["ekf"]
 
 
 EVERYTHING: dict[str, Any] = {

@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors.base import usable
+from tests.sampling import crossed
 
 RANGES = {"range_mask", "anchor_range_mask", "landmark_bearing_mask", "uav_bearing_mask"}
 OTHERS = {"landmark_mask", "height_mask", "position_fix_mask", "relative_pose_mask"}
+BAD = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e6)
 CASES = [
     ("ekf", "default"),
     ("ekf:robust=huber+gate+ransac+temporal+cross:fusion=ci", "default"),
@@ -70,8 +72,7 @@ def corrupted(
     return tools.change(observation, **spoiled), tools.change(observation, **missing)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1.0, 0.0, 1e6])
-@pytest.mark.parametrize(("name", "family"), CASES)
+@pytest.mark.parametrize(("name", "family", "bad"), crossed(CASES, BAD, every=3))
 def test_impossible_values_are_not_measured(
     name: str, family: str, bad: float, tools: SimpleNamespace
 ) -> None:

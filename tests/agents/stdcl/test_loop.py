@@ -110,9 +110,11 @@ def test_the_papers_loop_lowers_confidences_step_by_step() -> None:
 
 
 def test_a_variant_is_a_choice_of_parts() -> None:
-    """The default is the paper's loop with other parts, and each part can be named."""
-    _, _, one = beliefs("stdcl")
-    _, _, same = beliefs("stdcl:variant=paper:weights=stdcl:feedback=learned:confidence=em")
+    """The calibrated loop is the paper's with other parts, and each part can be named."""
+    _, _, one = beliefs("stdcl:variant=calibrated")
+    _, _, same = beliefs(
+        "stdcl:variant=paper:weights=stdcl_calibrated:feedback=learned:confidence=em"
+    )
     _, _, other = beliefs("stdcl:variant=paper:weights=none")
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
@@ -120,7 +122,13 @@ def test_a_variant_is_a_choice_of_parts() -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [("variant=papers", "did you mean|paper"), ("kappa=-1", "kappa=.-1"), ("kappa=x", "kappa")],
+    [
+        ("variant=papers", "did you mean|paper"),
+        ("kappa=-1", "kappa=.-1"),
+        ("kappa=x", "kappa"),
+        ("kappa=0.2:window=3", "kappa, window: for variant=calibrated or paper alone"),
+        ("weights=stdcl_paper", "weights of kind 'stgnn'"),
+    ],
 )
 def test_one_clear_line(options: str, words: str) -> None:
     with pytest.raises(ValueError, match=words) as error:

@@ -193,7 +193,7 @@ def test_wrong_options(agent: str, scenario: str, words: str) -> None:
 
 # ---------------------------------------------------------------- exact priors, corrections
 
-EVERY = (*METHODS, "dwmds", "vmds", "fcmds", "stdcl:weights=none")
+EVERY = (*METHODS, "dwmds", "vmds", "fcmds", "stdcl:variant=calibrated:weights=none")
 
 
 @pytest.mark.parametrize("agent", EVERY)
@@ -218,7 +218,7 @@ def test_an_exact_prior_is_kept(agent: str, family: str) -> None:
         observation = world.observation()
 
 
-@pytest.mark.parametrize("agent", ["dwmds_st", "map", "stdcl:weights=none"])
+@pytest.mark.parametrize("agent", ["dwmds_st", "map", "stdcl:variant=calibrated:weights=none"])
 def test_a_moved_belief_is_the_belief_of_a_moved_position(agent: str) -> None:
     """Without links the estimate follows the correction, and nothing else of it changes."""
     scenario = make_scenario("swarm-v0", **SMALL | {"comm_radius": 1.0, "anchor_share": 0.0})

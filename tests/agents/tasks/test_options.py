@@ -54,6 +54,15 @@ def test_the_teams_reward_is_the_mean_of_the_uavs_own(name: str) -> None:
     assert any(float(step.reward.std(-1).max()) > 0 for step in own)
 
 
+def test_the_estimator_may_have_options() -> None:
+    plain = steps("survey-v0:horizon=10:estimator=ekf_joint@second_order=true@iterations=1")[-1]
+    other = steps("survey-v0:horizon=10:estimator=ekf_joint@cooperate=false")[-1]
+    assert torch.equal(plain.error, steps("survey-v0:horizon=10")[-1].error)
+    assert not torch.equal(plain.error, other.error)
+    with pytest.raises(ValueError, match="ekf_joint: unknown option 'second'"):
+        make_task("survey-v0:estimator=ekf_joint@second=true")
+
+
 def test_what_is_nobodys_own_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match="relay-v0: credit='own' is not allowed") as caught:
         make_task("relay-v0:credit=own")

@@ -24,6 +24,7 @@ from agents.weights import learned
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
+from tests.sampling import crossed
 
 LANDMARKS, RANGES = 0, 1  # the blocks of indoor-v0
 PER_LINK = 3  # numbers remembered of each
@@ -441,11 +442,14 @@ def test_a_range_that_went_around_is_not_trusted_and_honest_ones_are(
         assert weight[mask.scatter(-1, planted, False)].mean() > 0.6
 
 
-@pytest.mark.parametrize(("name", "plain"), [("ekf_trust", "ekf"), ("pf_trust", "apf")])
 @pytest.mark.parametrize(
-    ("overrides", "share"),
-    [({"nlos": 0.3}, 0.8), ({"false_matches": 0.1}, 0.3)],
-    ids=["nlos", "false matches"],
+    ("name", "plain", "overrides", "share"),
+    crossed(
+        [("ekf_trust", "ekf"), ("pf_trust", "apf")],
+        [({"nlos": 0.3}, 0.8), ({"false_matches": 0.1}, 0.3)],
+        every=2,
+    ),
+    ids=str,
 )
 def test_trust_beats_none_in_every_world(
     name: str, plain: str, overrides: dict, share: float, tools: SimpleNamespace

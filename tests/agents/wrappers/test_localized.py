@@ -256,3 +256,6 @@ def test_torchrl_transform() -> None:
     seen = rollout["next", "agents", "observation"][:, -1, :, :2]
     truth = adapters.navigation.positions(base._env.scenario)
     torch.testing.assert_close(seen, truth, atol=3e-3, rtol=0)
+    error = rollout["next", "agents", "info", "localization_error"]
+    assert error.shape == (*seen.shape[:1], 6, seen.shape[1], 1)
+    assert (error < 0.05).all()

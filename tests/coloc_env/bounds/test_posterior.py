@@ -281,7 +281,21 @@ def predicted_differences(s: Tdoa, p: Kinematics, seen: Observation) -> tuple[Te
     anchors = torch.tensor(s.anchors, dtype=torch.float64)
     far = (tag_places(p, s.tags).unsqueeze(2) - anchors).norm(dim=-1)
     expected = torch.stack([far[..., n] - far[..., m] for m, n in s.pairs], -1).flatten(1)
-    return expected.repeat(1, s.depth), seen["tdoa_mask"][0].double() / s.std**2
+    return expected.repeat(1, s.depth), seen["tdoa_mask"][0].double() * mixed(s)
+
+
+def mixed(s: Tdoa) -> float:
+    """∫ p′² / p of (1 − q) N(0, σ²) + q N(0, τ²), by quadrature."""
+    if not s.tail:
+        return 1 / s.std**2
+    parts = ((1 - s.tail, s.std), (s.tail, s.tail_std))
+
+    def slope(e: float) -> float:
+        each = [share * norm.pdf(e, 0, std) for share, std in parts]
+        down = sum(p * e / std**2 for p, (_, std) in zip(each, parts, strict=True))
+        return float(down**2 / sum(each))
+
+    return float(2 * quad(slope, 0, 8 * s.std)[0] + 2 * quad(slope, 8 * s.std, 8 * s.tail_std)[0])
 
 
 def predicted_angles(s: ArrivalAngles, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
@@ -355,6 +369,7 @@ CASES: list[tuple[Sensor, int, Callable]] = [
     (PositionFix(0.3, count=1), 2, predicted_fix),
     (PositionFix(0.3, 2, vertical_std=0.7, dropout=0.3), 3, predicted_fix),
     (Tdoa(ANCHORS, 0.2, TAGS, ((0, 1), (2, 0)), depth=2, dropout=0.3), 3, predicted_differences),
+    (Tdoa(ANCHORS, 0.2, pairs=((0, 1), (2, 0)), tail=0.2, tail_std=1.5), 3, predicted_differences),
     (Tdoa(PLANE_ANCHORS, 0.2, PLANE_TAGS, ((0, 1),)), 2, predicted_differences),
     (ArrivalAngles(0.05, 0.1, dropout=0.3, depth=2), 3, predicted_angles),
     (AnchorRanging(ANCHORS, RangeNoise(0.3, dropout=0.3), TAGS), 3, predicted_anchors),

@@ -1,5 +1,6 @@
 """Bags that the tests write with rosbags itself."""
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,36 @@ def numbers() -> dict[str, np.ndarray]:
     }
 
 
+Row = tuple[str, str, int, Any]
+"""Topic, type, when it was written (ns), message."""
+
+
+def uwb_types(**definitions: str) -> dict[str, Any]:
+    """Custom types ``my_uwb/msg/NAME`` from the text of their definitions."""
+    from rosbags.typesys import get_types_from_msg
+
+    found: dict[str, Any] = {}
+    for name, text in definitions.items():
+        found |= get_types_from_msg(text, f"my_uwb/msg/{name}")
+    return found
+
+
 def write_bag(path: Path, kind: str) -> Path:
-    """A bag of ``kind`` ros1, ros2 or mcap with two robots' topics; its custom message holds a list
-    of exchanges. Headers' stamps of the IMU are not in order."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    """A bag with two robots' topics; its custom message holds a list of exchanges. Headers' stamps
+    of the IMU are not in order."""
+    types = uwb_types(Ranging=UWB, Exchange=EXCHANGE)
+    return write_rows(path, kind, types, lambda store: _messages(store, kind == "ros1"))
+
+
+def write_rows(
+    path: Path, kind: str, types: dict[str, Any], rows: Callable[[Any], Iterable[Row]]
+) -> Path:
+    """A bag of ``kind`` ros1, ros2 or mcap with the messages that ``rows`` makes of a type store,
+    which knows custom ``types``, too."""
+    from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(UWB, "my_uwb/msg/Ranging"))
-    store.register(get_types_from_msg(EXCHANGE, "my_uwb/msg/Exchange"))
+    store.register(types)
     if kind == "ros1":
         from rosbags.rosbag1 import Writer as Writer1
 
@@ -50,8 +73,7 @@ def write_bag(path: Path, kind: str) -> Path:
         writer = Writer2(path, version=9, storage_plugin=plugin)
     with writer:
         connections: dict[str, Any] = {}
-        rows = sorted(_messages(store, kind == "ros1"), key=lambda row: row[2])
-        for topic, msgtype, time, message in rows:
+        for topic, msgtype, time, message in sorted(rows(store), key=lambda row: row[2]):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, msgtype, typestore=store)
             raw = (
@@ -63,15 +85,17 @@ def write_bag(path: Path, kind: str) -> Path:
     return path
 
 
-def _messages(store: Any, first: bool) -> Any:
+def header(store: Any, time: int, first: bool) -> Any:
+    """A header with a stamp (ns), of ROS 1 (``first``) or 2."""
+    t = store.types
+    stamp = t["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9)
+    if first:
+        return t["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id="")
+    return t["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+
+
+def _messages(store: Any, first: bool) -> Iterator[Row]:
     t, made = store.types, numbers()
-
-    def header(time: int) -> Any:
-        stamp = t["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9)
-        if first:
-            return t["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id="")
-        return t["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-
     vector, point = t["geometry_msgs/msg/Vector3"], t["geometry_msgs/msg/Point"]
     level = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
     nine, wide = np.zeros(9), np.zeros(36)
@@ -83,13 +107,21 @@ def _messages(store: Any, first: bool) -> Any:
             "sensor_msgs/msg/Imu",
             time,
             t["sensor_msgs/msg/Imu"](
-                header(late), level, nine, vector(*row[:3]), nine, vector(*row[3:]), nine
+                header(store, late, first),
+                level,
+                nine,
+                vector(*row[:3]),
+                nine,
+                vector(*row[3:]),
+                nine,
             ),
         )
     pose = t["geometry_msgs/msg/Pose"]
     for i, (place, twist) in enumerate(zip(made["pose"], made["twist"], strict=True)):
         time = START + 50_000_000 * i
-        stamped = t["geometry_msgs/msg/PoseStamped"](header(time), pose(point(*place), level))
+        stamped = t["geometry_msgs/msg/PoseStamped"](
+            header(store, time, first), pose(point(*place), level)
+        )
         yield "/vicon/a", "geometry_msgs/msg/PoseStamped", time, stamped
         rate = t["geometry_msgs/msg/Twist"](
             vector(twist[0], twist[1], 0.0), vector(0.0, 0.0, twist[2])
@@ -99,7 +131,7 @@ def _messages(store: Any, first: bool) -> Any:
             "nav_msgs/msg/Odometry",
             time,
             t["nav_msgs/msg/Odometry"](
-                header(time),
+                header(store, time, first),
                 "base",
                 t["geometry_msgs/msg/PoseWithCovariance"](pose(point(*place), level), wide),
                 t["geometry_msgs/msg/TwistWithCovariance"](rate, wide),
@@ -111,7 +143,7 @@ def _messages(store: Any, first: bool) -> Any:
             "my_uwb/msg/Ranging",
             time,
             t["my_uwb/msg/Ranging"](
-                header(time),
+                header(store, time, first),
                 [
                     exchange(responder=7 + k, antenna=k % 2, distance_mm=int(d), valid=k < 2)
                     for k, d in enumerate(made["distance"][i])
@@ -120,7 +152,7 @@ def _messages(store: Any, first: bool) -> Any:
         )
     for i, height in enumerate(made["height"]):
         time = START + 60_000_000 * i
-        fields: tuple[Any, ...] = (header(time), 1, 0.1, 0.0, 9.0, float(height))
+        fields: tuple[Any, ...] = (header(store, time, first), 1, 0.1, 0.0, 9.0, float(height))
         more = () if first or len(t["sensor_msgs/msg/Range"].__dataclass_fields__) < 8 else (0.0,)
         yield "/a/laser", "sensor_msgs/msg/Range", time, t["sensor_msgs/msg/Range"](*fields, *more)
     for i, fix in enumerate(made["fix"]):
@@ -130,7 +162,11 @@ def _messages(store: Any, first: bool) -> Any:
             "sensor_msgs/msg/NavSatFix",
             time,
             t["sensor_msgs/msg/NavSatFix"](
-                header(time), t["sensor_msgs/msg/NavSatStatus"](status=0, service=1), *fix, nine, 0
+                header(store, time, first),
+                t["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+                *fix,
+                nine,
+                0,
             ),
         )
 

@@ -18,6 +18,7 @@ from coloc_env.motion import (
     Waypoints,
     Weave,
 )
+from tests.sampling import crossed
 
 ROOM = (30.0, 20.0, 5.0)
 ROUTE = Waypoints(route=((2.0, 2.0, 1.0), (9.0, 3.0, 2.0), (9.0, 3.0, 4.0), (5.0, 8.0, 1.5)))
@@ -97,8 +98,7 @@ def test_shapes_and_precision(name, fly, arena):
     assert {truth.position.dtype, truth.velocity.dtype, truth.attitude.dtype} == {torch.float64}
 
 
-@pytest.mark.parametrize("name", ALL)
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("name", "dim"), crossed(ALL, [2, 3], every=2))
 def test_velocity_is_the_derivative_of_position(name, dim, fly, arena):
     if dim == 2 and name not in FLAT:
         pytest.skip("3-D only")
@@ -152,7 +152,7 @@ def inside(truth, room, slack=1e-9):
 
 
 @settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     sides=st.tuples(st.floats(4, 200), st.floats(4, 200), st.floats(2.5, 60)),

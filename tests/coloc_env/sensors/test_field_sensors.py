@@ -5,10 +5,11 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest, norm
 from torch import Tensor
 
 from coloc_env.motion import Arena
@@ -55,6 +56,27 @@ def test_differences_are_of_distances(pairs: tuple) -> None:
         there.append(mask.double())
     is_normal(torch.cat(error), 0.2)
     assert float(torch.stack(there).mean()) == pytest.approx(0.7, abs=0.02)
+
+
+def test_a_tail_is_a_share_of_wide_noise_of_either_sign() -> None:
+    """Against the mixture's own distribution; the others are as without it, to the bit."""
+    errors, kept = [], []
+    plain, tailed = (seen_by(Tdoa(ONE, 0.1, tail=t, tail_std=2.0)) for t in (0.0, 0.2))
+    anchors = torch.tensor(ONE, dtype=torch.float64)
+    for (before, _), (seen, truth) in zip(plain, tailed, strict=True):
+        far = (truth.position.unsqueeze(-2) - anchors).norm(dim=-1)
+        exact = far[..., [1, 2, 3, 0]] - far
+        errors.append((seen["tdoa"] - exact).flatten())
+        kept.append((seen["tdoa"] == before["tdoa"]).flatten())
+    error, n = torch.cat(errors).numpy(), sum(map(len, errors))
+
+    def below(e: np.ndarray) -> np.ndarray:
+        return 0.8 * norm.cdf(e, 0, 0.1) + 0.2 * norm.cdf(e, 0, 2.0)
+
+    assert kstest(error, below).pvalue > 1e-4
+    assert float(torch.cat(kept).double().mean()) == pytest.approx(0.8, abs=5 * 0.4 / n**0.5)
+    with pytest.raises(ValueError, match="tail"):
+        Tdoa(ONE, tail=1.5)
 
 
 def test_two_anchors_have_one_difference() -> None:

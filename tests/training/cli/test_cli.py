@@ -8,14 +8,18 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import ModuleType
+from unittest.mock import MagicMock
 
 import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
 from training.cli.command import app
+from training.cli.render import _pace
+from training.cli.terminal import progress
 from training.evaluation.evaluate import split_agents
-from training.evaluation.files import FIGURES, WRITTEN
+from training.evaluation.files import FIGURES, VECTORS, WRITTEN
 
 SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]
 CHECKOUT = Path(__file__).parents[3]
@@ -45,6 +49,11 @@ def test_evaluate(tmp_path: Path) -> None:
     assert again.exit_code == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(set(WRITTEN) - set(FIGURES))
     assert json.loads((out / "results.json").read_text())["bound"] == {"rmse": None}
+    drawn = evaluate(out, "--agents", "test_still", "--vector", "--no-bound")
+    assert drawn.exit_code == 0
+    there = sorted(path.name for path in out.iterdir())
+    assert there == sorted({*WRITTEN, *VECTORS} - set(FIGURES))
+    assert "<svg" in (out / VECTORS[0]).read_text()
 
 
 def test_what_raises_is_reported(tmp_path: Path) -> None:
@@ -211,6 +220,26 @@ def test_one_agents_error_does_not_end_the_others(tmp_path: Path) -> None:
     assert "`test_still:wrong=missing` ended in an error" in (tmp_path / "out/table.md").read_text()
 
 
+def test_an_agent_that_does_not_serve_the_team_does_not_end_the_others(tmp_path: Path) -> None:
+    """``emvf`` where nothing is measured; a misspelt one beside it refuses everything at once."""
+    few = ("--set", "landmarks=0", "--no-bound", "--no-figures")
+    done = evaluate(tmp_path / "out", "--agents", "emvf,hpff,test_still", *few)
+    why = "emvf: what the team measures with Ranging would be ignored"
+    also = "hpff: the team has no distances to anchors to judge its filter by"
+    assert done.exit_code == 1
+    lines = done.stderr.splitlines()
+    assert lines[0].startswith(f"error: emvf has no results: {why}")
+    assert lines[1:] == [f"error: hpff has no results: {also}"]
+    agents = json.loads((tmp_path / "out" / "results.json").read_text())["agents"]
+    assert agents["test_still"]["rmse"] is not None
+    assert agents["emvf"]["rmse"] is None
+    assert agents["emvf"]["diagnostics"]["error"].startswith(why)
+    for wrong in ("emvf,ekff", "emvf,test_still:wrng=nan", "emvf", "emvf,pfnn:weights=non"):
+        done = evaluate(tmp_path / "none", "--agents", wrong, *few)
+        assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert not (tmp_path / "none").exists()
+
+
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "training.cli.command", *arguments]
 
@@ -247,6 +276,52 @@ def test_render(name: str, frames: int, tmp_path: Path) -> None:
     with Image.open(out) as image:
         assert getattr(image, "n_frames", 1) == frames
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    ("steps", "dt", "speed", "every", "hundredths"),
+    [(20, 0.1, 1.0, 1, 10), (20, 0.1, 0.5, 1, 20), (20, 0.1, 5.0, 1, 2), (30, 0.1, 3.0, 3, 10)],
+)
+def test_animations_keep_their_speed(
+    steps: int, dt: float, speed: float, every: int, hundredths: int
+) -> None:
+    assert _pace(steps, dt, speed) == (every, pytest.approx(100 / hundredths))
+
+
+def test_an_animation_of_a_speed_and_a_size(tmp_path: Path) -> None:
+    out, rest = tmp_path / "a.gif", ("--steps", "4", "--speed", "10", "--width", "300", *SMALL)
+    done = coloc("render", "indoor-v0", "--agent", "test_still", "--out", out, *rest)
+    assert done.exit_code == 0, done.output
+    with Image.open(out) as image:
+        assert (image.size, image.n_frames, image.info["duration"]) == ((300, 187), 2, 20)
+
+
+def test_in_ci_a_task_that_is_done_is_a_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for there in (True, False):
+        monkeypatch.setenv("CI", "true" if there else "")
+        with progress() as bars:
+            for done in (1, 2, 2):
+                bars("ekf", done, 2)
+            bars("map", 1, 2)
+        said = capsys.readouterr().err
+        assert said.startswith("ekf: 2 done, ") if there else said == ""
+        assert said.count("\n") == there
+
+
+def test_in_a_notebook_bars_are_a_widget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    widgets = ModuleType("ipywidgets")
+    display = ModuleType("IPython.display")  # the real one, outside a notebook, prints
+    for stands_in in (widgets, ModuleType("IPython"), display):
+        monkeypatch.setitem(sys.modules, stands_in.__name__, stands_in)
+    monkeypatch.setattr(display, "display", MagicMock(), raising=False)
+    shown = MagicMock()
+    monkeypatch.setattr(widgets, "Output", shown, raising=False)
+    with progress() as bars:
+        bars("ekf", 1, 2)
+    assert shown.called
 
 
 def test_lists() -> None:

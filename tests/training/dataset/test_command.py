@@ -35,6 +35,7 @@ def test_a_dataset_is_written_and_another_is_refused(tmp_path: Path) -> None:
         (["indoor-v0", "--steps", "9999"], "--steps 9999 is not allowed: 1 to 1000"),
         (["indoor-v0", "--set", "tdoa_anchors=1"], "tdoa_anchors=1 is not allowed"),
         (["indoor-v0", "--seed", "-1"], "--seed -1 is not allowed"),
+        (["indoor-v0", "--set", "links=chosen"], "links=chosen is not allowed: nobody chooses"),
     ],
 )
 def test_what_is_wrong_is_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:

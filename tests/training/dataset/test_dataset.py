@@ -89,6 +89,38 @@ def test_both_forms_hold_what_the_worlds_and_the_agent_made(
     assert torch.equal(parts[2]["worlds", "prior"][0], world.static["prior"][4])
 
 
+@pytest.mark.parametrize("control", ["velocity", "acceleration"])
+def test_steered_uavs_follow_random_commands(
+    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the column ``command``, whatever else is run: velocities are integrated from them,
+    within the limit."""
+    monkeypatch.setattr(plans, "_MOST_RUNS", 2)
+    built = scenario(control=control, a_max=1.0, horizon=12, room=(900.0, 900.0, 90.0))
+    write_dataset(Plan(built, 3, 7, 12), tmp_path / "three")
+    write_dataset(Plan(built, 1, 8, 12), tmp_path / "one")
+    parts = read(tmp_path / "three")[1]
+    steps = torch.cat([part["steps"].to_tensordict() for part in parts])
+    alone = read(tmp_path / "one")[1][0]["steps"].to_tensordict()
+    for name in (("command",), ("truth", "velocity"), ("observation", "imu")):
+        assert torch.equal(steps.get(name)[1], alone.get(name)[0])
+    command, v = steps["command"].double(), steps["truth", "velocity"]
+    assert torch.equal(command[:, 0], command[:, 9])
+    assert (command[:, 9] != command[:, 10]).all()
+
+    def within(x: torch.Tensor, most: float) -> torch.Tensor:
+        return x * (most / x.norm(dim=-1, keepdim=True)).clamp_max(1.0)
+
+    if control == "velocity":
+        wanted = within(within(command, 3.0)[:, :-1] - v[:, :-1], 0.1)  # 1 m/s² for 0.1 s
+    else:
+        wanted = within(v[:, :-1] + within(command[:, :-1] * 0.1, 0.1), 3.0) - v[:, :-1]
+    torch.testing.assert_close(v.diff(dim=1), wanted, rtol=0, atol=1e-9)
+    facts = json.loads((tmp_path / "one" / "dataset.json").read_text())
+    (column,) = (c for c in facts["columns"] if c["name"] == "command")
+    assert column["unit"] == {"velocity": "m/s", "acceleration": "m/s²"}[control]
+
+
 def test_the_card_and_the_facts_say_what_is_there(tmp_path: Path) -> None:
     write_dataset(Plan(scenario(tdoa_anchors=4), 2, 3, K, "ekf"), tmp_path)
     facts = json.loads((tmp_path / "dataset.json").read_text())

@@ -34,3 +34,10 @@ def test_notebooks_show_the_table(made_up: Evaluation) -> None:
     assert text.startswith("<table>")
     for agent in made_up.agents:
         assert f"<td>{agent}</td>" in text
+
+
+def test_notebooks_show_a_record(made_up: Evaluation) -> None:
+    name, one = next(iter(made_up.agents.items()))
+    text = one._repr_html_()
+    assert f"<td>{made_up.summary['agents'][name]['rmse']:.3g} m</td>" in text
+    assert f"<td>{', '.join(map(str, one.error.shape))}</td>" in text

@@ -21,6 +21,7 @@ from agents.weights import untrained
 from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario, parse_scenario
+from tests.sampling import first_fast
 from training.evaluation.record import record
 from training.learning import nnhpff as training
 from training.learning import run as runs
@@ -233,7 +234,7 @@ def test_same_seed_same_weights(unbroken: Path, tmp_path: Path) -> None:
     assert outcome(tmp_path / "other")[weights] != outcome(unbroken)[weights]
 
 
-@pytest.mark.parametrize("losses", [2, LOSSES + 2, 2 * LOSSES])
+@pytest.mark.parametrize("losses", first_fast(LOSSES + 2, 2, 2 * LOSSES))
 def test_interrupted_in_training(
     unbroken: Path, losses: int, tmp_path: Path, interrupted: Callable[..., Any]
 ) -> None:

@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 
 from coloc_env import state_file
 from coloc_env.options import fits
+from tests.sampling import first_fast
 from training.learning import pfnn
 from training.learning import run as runs
 from training.learning.collectors import EpochCollector
@@ -57,7 +58,7 @@ def test_same_seed_same_weights(mode: str, unbroken: dict[str, bytes], tmp_path:
     assert other["pfnn.safetensors"] != unbroken["pfnn.safetensors"]
 
 
-@pytest.mark.parametrize("losses", [1, 5, 8])
+@pytest.mark.parametrize("losses", first_fast(5, 1, 8))
 def test_interrupted_in_training(
     mode: str,
     unbroken: dict[str, bytes],

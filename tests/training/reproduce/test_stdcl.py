@@ -337,7 +337,7 @@ def test_goals_are_met_by_the_mean() -> None:
     assert found["better than `dwmds_st`: NLOS 50 %"] == MET  # not worse
     assert found["better than `dwmds_st`: R = 1230 m"] == MISSED
     assert found["degree 2.5: of INS alone"] == MISSED
-    assert found["N = 200: median time of `stdcl`"] == UNKNOWN
+    assert found["N = 200: median time of `stdcl:variant=calibrated`"] == UNKNOWN
 
 
 # ---------------------------------------------------------------- all of it at once

@@ -188,7 +188,12 @@ INDOOR, SWARM = "coloc_env/scenarios/indoor.py", "coloc_env/scenarios/swarm.py"
         ("agents/kalman/ekf.py", "indoor-v0", "pf500", False),
         ("agents/policies/learned.py", "indoor-v0", "mappo", True),
         ("agents/kalman/ekf.py", "indoor-v0", "mappo", True),  # the policy's base
-        ("agents/swarm/dwmds_st.py", "swarm-v0", "stdcl", True),  # the optimizer in the loop
+        (
+            "agents/swarm/dwmds_st.py",
+            "swarm-v0",
+            "stdcl:variant=paper",
+            True,
+        ),  # the optimizer in the loop
         ("training/evaluation/record.py", "indoor-v0", "ekf", True),
         ("training/evaluation/figures.py", "indoor-v0", "ekf", False),
         ("training/reproduce/tables.py", "indoor-v0", "ekf", False),

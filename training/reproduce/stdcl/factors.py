@@ -15,7 +15,7 @@ from training.reproduce.work import POSTERIOR, Cell, Variant
 BEFORE = "map:bias=own:factors=weights"
 JOINT = "map:bias=joint:factors=weights"
 WHOLE = "map:bias=joint:factors=ep"
-LEARNED = "stdcl_factors"
+LEARNED = "stdcl"
 METHODS = (BEFORE, JOINT, WHOLE, LEARNED)
 _SIZE = (6694.0, 6694.0, 3347.0)  # m: the density of 200 UAVs in 10 × 10 × 5 km
 _S3_STEPS = 1200  # of 9000: two minutes of the patrol

@@ -8,7 +8,7 @@ from training.reproduce.settings import Settings
 from training.reproduce.work import POSTERIOR, SNAPSHOT, Cell, Kind, Variant
 
 TITLE = "Spatio-temporally decoupled cooperative localization, *Drones* 2026, 10(1), 69"
-WHOLE, OPTIMIZER, HUBER = "stdcl", "dwmds_st", "dwmds_st:confidence=huber"
+WHOLE, OPTIMIZER, HUBER = "stdcl:variant=calibrated", "dwmds_st", "dwmds_st:confidence=huber"
 RIVALS = ("mds", "fcmds", "dwmds", "vmds")  # the paper's, in its order
 LEARNED = "stgat"
 # The paper's own: Huber's loss times equation 17, corrections, the feedback of equation 36.
@@ -18,16 +18,16 @@ REFERENCES = ("gn", "map")  # expensive: they run in fewer worlds
 # Step by step from the optimizer to the whole, each with weights trained as it is used.
 ABLATION = {
     OPTIMIZER: "DW-MDS alone",
-    "stdcl:weights=stdcl_attention": "+ attention, fed back",
+    f"{WHOLE}:weights=stdcl_attention": "+ attention, fed back",
     WHOLE: "+ convolutions: whole",
 }
-OPEN = "stdcl:weights=stdcl_open:feedback=none"  # trained with the loop open, used so
-UNFED = "stdcl:feedback=none"  # the whole's own weights, with the loop cut
+OPEN = f"{WHOLE}:weights=stdcl_open:feedback=none"  # trained with the loop open, used so
+UNFED = f"{WHOLE}:feedback=none"  # the whole's own weights, with the loop cut
 # Of the paper's own, each with weights trained in its own loop.
 PAPERS_UNFED = "stdcl:variant=paper:feedback=none"
 PAPERS_FEEDBACK = "stdcl:variant=paper:weights=none"  # equation 36 alone, without a network
 PAPERS_LEARNED = "stdcl:variant=paper:feedback=learned:weights=stdcl_paper_learned"
-CLOSED_AFTERWARDS = "stdcl:weights=stdcl_open:feedback=positions"
+CLOSED_AFTERWARDS = f"{WHOLE}:weights=stdcl_open:feedback=positions"
 LOOPS = {
     OPEN: "trained without feedback",
     UNFED: "whole, loop cut",

@@ -28,7 +28,7 @@ _STYLES: dict[str, tuple[str, str, Any]] = {
     plan.LEARNED: ("ST-GAT", "#CC79A7", "-"),
     plan.HUBER: ("DW-MDS, Huber", "#E69F00", (0, (4, 2))),
     plan.OPTIMIZER: ("DW-MDS, calibrated", "#E69F00", "-"),
-    plan.WHOLE: ("ST-DCL", "#D55E00", "-"),
+    plan.WHOLE: ("ST-DCL, calibrated", "#D55E00", "-"),
     f"{plan.OPTIMIZER}:confidence=none": ("DW-MDS, all alike", "#7F7F1F", (0, (4, 2))),
     f"{plan.OPTIMIZER}:confidence=paper": ("DW-MDS, the paper's", "#44AA99", "-"),
     "gn": ("Gauss–Newton", "#882255", (0, (1, 1.5))),

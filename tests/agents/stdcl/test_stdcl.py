@@ -24,7 +24,7 @@ from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 
-NEW = "stdcl_factors:weights=none:bank=false"
+NEW = "stdcl:weights=none"
 
 
 def small(n_uavs: int = 14, **overrides: float) -> Scenario:
@@ -64,12 +64,13 @@ def estimates(
 
 SWARM = small(nlos=0.3, nlos_time=10.0)
 CAMPUS = make_scenario("campus-v0", flight="s2", horizon=10)
+ANCHORS = make_scenario("indoor-v0", n_uavs=3, landmarks=0, anchors=8, horizon=10)
 
 
 @pytest.mark.parametrize(
     ("agent", "scenario"),
-    [(NEW, SWARM), ("stdcl_factors:weights=none", SWARM), (NEW, CAMPUS)],
-    ids=["alone", "bank", "campus"],
+    [(NEW, SWARM), (f"{NEW}:bank=true", SWARM), (NEW, CAMPUS), (NEW, ANCHORS)],
+    ids=["alone", "bank", "campus", "anchors"],
 )
 def test_without_training_it_is_map(agent: str, scenario: Scenario) -> None:
     for ours, theirs in zip(
@@ -184,6 +185,27 @@ def test_convolutions_look_at_the_past_alone() -> None:
         assert moved == (age <= network.steps)
 
 
-def test_a_team_with_lever_arms_is_refused() -> None:
-    with pytest.raises(ValueError, match="would be ignored"):
-        make("stdcl_factors:weights=none", make_scenario("indoor-v0"))
+def test_among_anchors_the_network_has_a_say() -> None:
+    """It remembers links between UAVs and anchors at both ends, and bears a range."""
+    localizer: Any = make(NEW, ANCHORS)
+    localizer.swarm.learn(randomized())
+    world = World(ANCHORS, 2)
+    observation = world.reset(0)
+    belief = localizer.reset(observation)
+    for _ in range(3):
+        belief, _ = localizer.step(belief, observation)
+        world.advance(localizer.step(belief, observation)[1].action())
+        observation = world.observation()
+    means = belief.swarm.memory.means.seen
+    assert means.shape == (2, 3, 11)
+    assert bool((means[..., 3:] > 0).any())
+    whole = localizer.swarm.of_members(belief.swarm, 8).memory.means.seen
+    torch.testing.assert_close(whole, whole.mT)
+
+
+@pytest.mark.parametrize("variant", ["calibrated", "paper"])
+def test_the_loops_serve_teams_whose_motion_an_ins_drives(variant: str) -> None:
+    with pytest.raises(ValueError, match="whose motion an INS drives"):
+        make(f"stdcl:variant={variant}:weights=none", ANCHORS)
+    with pytest.raises(ValueError, match="bank=true is for teams whose motion an INS drives"):
+        make(f"{NEW}:bank=true", ANCHORS)

@@ -1,0 +1,90 @@
+"""Trainings on a card that is only pretended: worlds, networks, buffers and losses are on it, and
+what is learned is what is learned on the CPU."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from pretended import OnCard, card
+from safetensors.torch import load_file
+
+from coloc_env.json_files import read_json
+from training.evaluation.evaluate import silent
+from training.learning import run, trust
+from training.learning.registry import TRAININGS
+
+ROOM = "indoor-v0:n_uavs=2:horizon=20:motion=random"
+LEAST = {"worlds": 1, "epochs": 1, "score_runs": 0}
+SWARM = LEAST | {
+    "scenario": "swarm-v0:n_uavs=10:anchor_share=0.4:horizon=10:comm_radius=9000",
+    "variants": "nlos=0.3",
+    "steps": 5,
+}
+POLICY = LEAST | {"scenario": ROOM, "steps": 5, "passes": 1, "minibatches": 2, "hidden": 8}
+KINDS: dict[str, dict[str, Any]] = {
+    "pfnn": LEAST | {"scenario": ROOM, "passes": 1, "minibatch": 100},
+    "dlspf": LEAST | {"scenario": ROOM.replace("20", "24"), "passes": 1},
+    "nnhpff": LEAST
+    | {
+        "scenario": "wsn-v0:horizon=20",
+        "variants": "case=1",
+        "mains": "pf:particles=60",
+        "passes": 1,
+    },
+    "trust": LEAST | {"scenario": "indoor-v0:n_uavs=2:horizon=5", "steps": 5},
+    "stdcl": SWARM,
+    "stdcl_loop": SWARM,
+    "mappo": POLICY,
+    "ippo": POLICY | {"recurrent": False, "base": "none"},
+}
+ON_CPU = ("sb3-ppo", "task-ippo", "task-mappo", "task-qmix", "task-sb3-ppo")
+SAME = 1e-5
+
+
+def test_every_training_is_here() -> None:
+    assert {*KINDS, *ON_CPU} == set(TRAININGS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_what_is_learned_is_the_cpus(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trust, "VARIANTS", ("nlos=0.3",))
+    here = load_file(run.start(name, KINDS[name], tmp_path / "cpu", silent))
+    losses: list[torch.Tensor] = []
+    whole = torch.Tensor.backward
+
+    def backward(loss: torch.Tensor, *args: Any, **named: Any) -> None:
+        losses.append(loss)
+        whole(loss, *args, **named)
+
+    monkeypatch.setattr(torch.Tensor, "backward", backward)
+    with card():
+        there = load_file(run.start(name, KINDS[name], tmp_path / "card", silent, device="cuda"))
+    assert losses
+    assert all(isinstance(loss, OnCard) for loss in losses)
+    for key, value in here.items():
+        torch.testing.assert_close(there[key], value, rtol=SAME, atol=SAME)
+    config = read_json(tmp_path / "card" / "run.json", "a run", {})
+    assert config["device"] == "cuda"
+    assert config["command"].endswith(f"--device cuda --out {tmp_path / 'card'}")
+
+
+def test_a_training_that_knows_the_cpu_alone(tmp_path: Path) -> None:
+    for name in ON_CPU:
+        with card(), pytest.raises(ValueError, match=f"{name} trains on the CPU: --device cuda is"):
+            run.start(name, {}, tmp_path / "out", silent, device="cuda")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_goes_on_where_it_was_started(tmp_path: Path) -> None:
+    """On a machine without a card it says so, in a line that names the file."""
+    started = {"training": "pfnn", "options": {}, "command": "", "threads": 1, "device": "cuda:7"}
+    file = tmp_path / "run.json"
+    file.write_text(json.dumps(started), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"^{file}: --device cuda:7 is not there: cpu") as said:
+        run.resume(tmp_path, silent)
+    assert "\n" not in str(said.value)
