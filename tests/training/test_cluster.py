@@ -197,6 +197,7 @@ def test_a_cluster_that_dies_is_said_to_be_dead(tmp_path: Path) -> None:
     assert "run the command again" in done.stdout
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of libraries, as Python hides them
 @pytest.mark.parametrize(
     ("address", "words"),
     [
@@ -223,7 +224,14 @@ def test_ray_that_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def _one_line(command: str, address: str, folder: Path) -> str:
     what = {"evaluate": ["indoor-v0", "--agents", "ekf"], "reproduce": ["cspf"], "bench": []}
-    words = [command, *what.get(command, ["nnhpff"]), "--out", str(folder / "out"), "--ray", address]
+    words = [
+        command,
+        *what.get(command, ["nnhpff"]),
+        "--out",
+        str(folder / "out"),
+        "--ray",
+        address,
+    ]
     done = CliRunner().invoke(app, words)
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1

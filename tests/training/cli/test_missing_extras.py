@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of libraries, as Python hides them
 @pytest.mark.parametrize("extra", COMMANDS)
 def test_a_command_names_the_extra(
     extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
