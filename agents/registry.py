@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from agents.localizer import Localizer
     from coloc_env.scenario import Believed, Scenario
 
+
+class NotServed(ValueError):
+    """A team is one that a localizer cannot estimate: it measures nothing that it could use, say.
+    Raised where the localizer is built; no option or name is wrong."""
+
+
 LOCALIZERS = Registry(
     "agent",
     "coloc.localizers",
@@ -59,9 +65,9 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
 
     ``name`` may carry options as on the command line (``"ekf:robust=huber"``); a piece without "="
     belongs to the option before, and so does one that names no option where either is a path: paths
-    may have colons. Raises ValueError, in one line that
-    names what is allowed, for an unknown name or option, and for a team that measures what the
-    localizer would ignore.
+    may have colons. Raises ValueError, in one line that names what is allowed, for an unknown name
+    or option; ``NotServed`` for a team that measures what the localizer would ignore, or lacks what
+    it needs.
     """
     name, *pieces = name.split(":")
     factory = LOCALIZERS.require(name)
@@ -80,8 +86,8 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     try:
         made: Localizer = build(believed, **options.grouped(factory, chosen))
     except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
+        text, kind = str(error), NotServed if isinstance(error, NotServed) else ValueError
+        raise kind(text if text.startswith(name) else f"{name}: {text}") from error
     return made
 
 
@@ -96,7 +102,7 @@ def _is_path(*texts: str) -> bool:
 
 
 def _require_served(name: str, factory: Factory, believed: Believed) -> None:
-    """Raise ValueError if a localizer would ignore what the team measures; name those that fit.
+    """Raise NotServed if a localizer would ignore what the team measures; name those that fit.
 
     One that uses whatever has a measurement model goes on without a sensor that has none, as long
     as something is left to use, and warns of it.
@@ -113,7 +119,7 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
             _warn_of_unmodelled(sensor)
     else:
         others = [one for one in LOCALIZERS if not _ignored(LOCALIZERS[one], believed)]
-        raise ValueError(
+        raise NotServed(
             f"{name}: what the team measures with {', '.join(ignored)} would be ignored; "
             f"these use it: {', '.join(others) or 'none'}"
         )

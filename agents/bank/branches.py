@@ -1,14 +1,14 @@
 """Two branches of one filter as rows of one batch."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from agents.bank.evidence import predictive_score
+from agents.bank.scored import Judgement, measured_score
 from agents.models.measurements import Block
 from agents.robust import Prediction, Screen, Trust
 from agents.robust.capped import capped
@@ -17,14 +17,6 @@ from agents.tensorclasses import build
 from coloc_env.observation import Observation
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """The candidate's evidence about its rows, and the predictive score of all."""
-
-    candidate: Any
-    score: Float[Tensor, "B N"]
 
 
 class Branched(Screen):
@@ -50,11 +42,10 @@ class Branched(Screen):
         )
 
     def judge(self, blocks: Sequence[Block], prediction: Prediction) -> Judgement:
-        pairs = zip(self.models, blocks, strict=True)
-        measured = [block for model, block in pairs if model.testable]
+        """The candidate's evidence about its rows, and the score of all."""
         return Judgement(
             self.candidate.judge(_second(blocks), _of_candidate(prediction)),
-            predictive_score(measured, prediction.covariance, self.degrees),
+            measured_score(self.models, blocks, prediction.covariance, self.degrees),
         )
 
     def weigh(self, blocks: Sequence[Block], evidence: Judgement, last: bool) -> list[Trust]:
@@ -62,7 +53,7 @@ class Branched(Screen):
         if not last:
             return [Trust(weight) for weight in huber]
         halves = [weight.chunk(2) for weight in huber]
-        trusts = self.candidate.weigh(_second(blocks), evidence.candidate, last)
+        trusts = self.candidate.weigh(_second(blocks), evidence.evidence, last)
         trusts = capped([half[1] for half in halves], trusts)
         return [
             Trust(torch.cat((half[0], t.weight)), _after_zeros(t.shift))
@@ -77,7 +68,7 @@ class Branched(Screen):
         after: Callable[[], Sequence[Block]],
     ) -> Float[Tensor, "B N K"]:
         own = self.candidate.remember(
-            _of_candidate(prediction), evidence.candidate, lambda: _second(after())
+            _of_candidate(prediction), evidence.evidence, lambda: _second(after())
         )
         rows = torch.cat((torch.zeros_like(own), own))
         return torch.cat((rows, evidence.score.unsqueeze(-1)), -1).to(prediction.memory)

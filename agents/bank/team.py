@@ -1,92 +1,49 @@
-"""A bank for filters that estimate a whole team at once: a learned loop falls back to ``map``."""
+"""A bank for filters that estimate a whole team at once: what is learned falls back to ``map``."""
 
 from typing import Any
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from agents.bank.bank import BankBelief, candidate_speaks, spoken
-from agents.bank.branches import stacked
-from agents.bank.evidence import BankOptions, accumulated, predictive_score
-from agents.localizer import Estimate, Localizer
+from agents.bank.bank import BankBelief
+from agents.bank.evidence import predictive_score
+from agents.bank.side_by_side import SideBySide
 from agents.models.measurements import Block
 from agents.swarm.belief import StepInput
 from agents.swarm.links import lengths
-from agents.tensorclasses import build
 from coloc_env.observation import Observation
 
 
-class TeamBank(Localizer[BankBelief]):
-    """Two methods side by side. Each UAV speaks with the learned one while the evidence A ≥ 0 that
-    this predicts its ranges better; at A < θ it is moved to where the other has it, with A = 0."""
+class TeamBank(SideBySide):
+    """A learned filter of swarms beside a swarm filter: evidence is of ranges between UAVs. What
+    restarts is moved to where the other has it."""
 
     name = "team_bank"
     centralized = True
-
-    def __init__(self, candidate: Any, fallback: Any, options: BankOptions) -> None:
-        """``candidate``: a learned filter of swarms; ``fallback``: a swarm filter."""
-        super().__init__(candidate.believed)
-        self.name = candidate.name  # type: ignore[misc]
-        self.candidate, self.fallback, self.options = candidate, fallback, options
+    shares = "learned_share", "map_share"
 
     @property
     def exchanges(self) -> bool:
         return True
 
-    def reset(self, observation: Observation) -> BankBelief:
-        fallback = self.fallback.reset(observation)
-        nothing = torch.zeros(fallback.batch_size, dtype=torch.float64, device=observation.device)
-        return BankBelief(
-            fallback=fallback,
-            candidate=self.candidate.reset(observation),
-            evidence=nothing,
-            restarted=nothing > 0,
-            batch_size=fallback.batch_size,
-        )
-
-    def step(self, belief: BankBelief, observation: Observation) -> tuple[BankBelief, Estimate]:
-        degrees = self.options.degrees
+    def scores(
+        self, before: BankBelief, after: BankBelief, observation: Observation
+    ) -> tuple[Float64[Tensor, "B N"], Float64[Tensor, "B N"]]:
+        pairs = (self.candidate, before.candidate), (self.fallback, before.fallback)
         ours, theirs = (
-            range_score(branch.predict(state, observation), branch.std, degrees)
-            for branch, state in (
-                (self.candidate, belief.candidate),
-                (self.fallback, belief.fallback),
-            )
+            range_score(one.predict(belief, observation), one.std, self.options.degrees)
+            for one, belief in pairs
         )
-        evidence = accumulated(belief.evidence, ours, theirs, self.options.forgetting)
-        fallback, classical = self.fallback.step(belief.fallback, observation)
-        candidate, learned = self.candidate.step(belief.candidate, observation)
-        restarted = evidence < self.options.restart
-        apart = (classical.position - learned.position) * restarted.unsqueeze(-1)
-        after = build(
-            BankBelief,
-            belief.batch_size,
-            fallback=fallback,
-            candidate=self.candidate.shifted(candidate, apart),
-            evidence=evidence.masked_fill(restarted, 0.0),
-            restarted=restarted,
-        )
-        return after, spoken(evidence >= 0, stacked(classical, learned))
+        return ours, theirs
 
-    def mean(self, belief: BankBelief) -> Float64[Tensor, "B N S"]:
-        ours = self.candidate.mean(belief.candidate)
-        speaks = candidate_speaks(belief)
-        return torch.where(speaks.unsqueeze(-1), ours, self.fallback.mean(belief.fallback))
-
-    def shifted(self, belief: BankBelief, offset: Float64[Tensor, "B N d"]) -> BankBelief:
-        return belief.replace(
-            fallback=self.fallback.shifted(belief.fallback, offset),
-            candidate=self.candidate.shifted(belief.candidate, offset),
-        )
-
-    def diagnostics(self, belief: BankBelief) -> dict[str, Tensor]:
-        speaks = candidate_speaks(belief)
-        return self.candidate.diagnostics(belief.candidate) | {
-            "learned_share": speaks.float(),
-            "map_share": (~speaks).float(),
-            "restarts_per_run": belief.restarted.float(),
-        }
+    def restarted(
+        self, belief: BankBelief, rows: Bool[Tensor, "B N"], observation: Observation
+    ) -> Any:
+        d = self.fallback.process.dim
+        there, here = self.fallback.mean(belief.fallback), self.candidate.mean(belief.candidate)
+        apart = (there - here)[..., :d] * rows.unsqueeze(-1)
+        return self.candidate.shifted(belief.candidate, apart)
 
 
 def range_score(inputs: StepInput, std: float, degrees: float) -> Float64[Tensor, "B N"]:

@@ -9,6 +9,7 @@ from torch import Tensor
 from agents.factor_graph.chain import Chain, Smoothed, smooth
 from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
 from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.registry import NotServed
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
@@ -36,7 +37,7 @@ class CentralFactorGraph(DistributedFactorGraph):
             believed, window=window, iterations=iterations, robust=robust, exchange="none"
         )
         if believed.slots != believed.arena.n_uavs:
-            raise ValueError("estimates all UAVs at once: each needs a slot for every other")
+            raise NotServed("estimates all UAVs at once: each needs a slot for every other")
         self.own = make_measurements(believed)
 
     @property

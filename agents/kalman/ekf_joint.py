@@ -20,6 +20,7 @@ from agents.models.measurements.second_order import expanded
 from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.models.process import make_process
 from agents.models.update import posterior
+from agents.registry import NotServed
 from agents.robust import Prediction, RobustScreen, Trust
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -54,7 +55,7 @@ class JointEkf(Localizer[GaussianBelief]):
     ) -> None:
         super().__init__(believed)
         if believed.slots < believed.arena.n_uavs:
-            raise ValueError(
+            raise NotServed(
                 f"ekf_joint: a team of {believed.arena.n_uavs} with {believed.slots} neighbour "
                 "slots is too large for it; raise max_neighbours to the team's size"
             )

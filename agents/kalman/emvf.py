@@ -24,6 +24,7 @@ from agents.models.measurements import (
     no_neighbours,
 )
 from agents.models.process import Process
+from agents.registry import NotServed
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -83,7 +84,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         self.process: Process = self.reckoning.process
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
         if not self.models:
-            raise ValueError("the team measures nothing of its own to estimate from")
+            raise NotServed("the team measures nothing of its own to estimate from")
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
         anchors, dim = believed.sensor(AnchorRanging), believed.arena.dim
@@ -103,7 +104,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         low, high = -float(side.min()), float(side.max())
         if min(low, high) > _BESIDE * max(low, high):
             flat = "plane" if arena.dim == 3 else "line"
-            raise ValueError(
+            raise NotServed(
                 f"all {len(sensor.anchors)} anchors lie in one {flat} through the room: ranges to "
                 "them alone do not say on which side of it a UAV is; add anchors beside it, "
                 "landmarks, or choose ekf or pf500, which have a prior"

@@ -22,6 +22,7 @@ from agents.kalman.fusion import Fusion, Rows, Taken, gains_of, rows_of
 from agents.models.biases import kept_share
 from agents.models.measurements import Block, Measurement, Neighbours
 from agents.models.process import Process
+from agents.registry import NotServed
 from agents.robust import Prediction, Trust
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -52,7 +53,7 @@ class Pairwise(Fusion):
         super().__init__(believed, process, models)
         n = believed.arena.n_uavs
         if believed.slots < n:
-            raise ValueError(
+            raise NotServed(
                 f"fusion=pairwise: a team of {n} with {believed.slots} neighbour slots is too "
                 "large for it; raise max_neighbours to the team's size"
             )

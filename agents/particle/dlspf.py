@@ -18,6 +18,7 @@ from agents.particle.latent import WINDOW, LatentModel, unaccelerated
 from agents.particle.likelihood import log_likelihood
 from agents.particle.resampling import FLOOR, Resampling, per_error
 from agents.particle.tempering import tempered
+from agents.registry import NotServed
 from agents.robust import Trust
 from agents.tensorclasses import build
 from agents.weights import learned
@@ -83,7 +84,7 @@ class LatentParticleFilter(Localizer[LatentBelief]):
         d = self.process.dim
         turns = self.process.attitude_error
         if d != 3 or self.process.error_size < 2 * d or (turns and turns.start != 2 * d):
-            raise ValueError("a motion model in space that estimates velocity is needed")
+            raise NotServed("a motion model in space that estimates velocity is needed")
         self.capacity, self.seed = particles, seed
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.model = learned(LatentModel, weights, seed)

@@ -11,11 +11,13 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.bank import BankOptions, Trial
+from agents.bank.kalman_fallback import KalmanFallback
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import Detector, Evidence, evidence
-from agents.registry import make_inner
+from agents.particle.filter import ParticleFilter
+from agents.registry import NotServed, make_inner
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
@@ -47,7 +49,8 @@ class HybridFilter(Localizer[HybridBelief]):
     outside the arena, or knows no more than that it is inside, restarts nothing.
 
     Restarts are on trial (``agents.bank.Trial``): the main filter speaks until one has predicted
-    better, and the auxiliary's place must besides be well-posed and fit what is measured better.
+    better, and the auxiliary's place must besides be well-posed and fit what is measured better. A
+    particle filter speaks, besides, only while it predicts no worse than ``ekf:robust=huber``.
     ``bank=false``: they take effect at once.
     """
 
@@ -66,7 +69,7 @@ class HybridFilter(Localizer[HybridBelief]):
         super().__init__(believed)
         sensor = believed.sensor(AnchorRanging)
         if sensor is None:
-            raise ValueError("the team has no distances to anchors to judge its filter by")
+            raise NotServed("the team has no distances to anchors to judge its filter by")
         self.main: Localizer[Any] = make_inner(main, believed)
         self.auxiliary: Localizer[Any] = make_inner(auxiliary, believed)
         if type(self.main).restart_from is Localizer.restart_from:
@@ -75,7 +78,9 @@ class HybridFilter(Localizer[HybridBelief]):
             raise ValueError(f"auxiliary={auxiliary!r} is not allowed: emvf or a Kalman filter")
         self.on_trial = bank.bank
         if self.on_trial:
-            self.main = Trial(self.main, bank)
+            on_trial = Trial(self.main, bank)
+            particles = isinstance(self.main, ParticleFilter)
+            self.main = KalmanFallback(on_trial, bank, "main_share") if particles else on_trial
         self.detector, self.threshold, self.patience = detector, threshold, patience
         self.process, self.model = make_process(believed), AnchorRanges(sensor)
         arena = (believed.arena.low, believed.arena.high)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.models.process import drives
+from agents.registry import NotServed
 from agents.stdcl.features import GraphInputs, RunningMeans, graph_inputs, initial_means
 from agents.stdcl.feedback import FEEDBACKS, KAPPA, FeedbackKind
 from agents.stdcl.network import ConvolutionState, Correction, StGnn
@@ -56,7 +57,7 @@ class NetworkLoop(Localizer[LoopBelief]):
     ) -> None:
         super().__init__(base.believed)
         if not is_plain(base.believed):
-            raise ValueError(
+            raise NotServed(
                 "a team is needed whose motion an INS drives, with ranges between centres"
             )
         self.base, self.feedback, self.std = base, FEEDBACKS[feedback](kappa), base.std

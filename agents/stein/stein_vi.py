@@ -21,6 +21,7 @@ from agents.models.preintegration import Preintegrated
 from agents.models.process import InertialProcess
 from agents.particle.belief import normal, own_keys
 from agents.particle.sampling import from_prior
+from agents.registry import NotServed
 from agents.stein.estimate import Manifold, map_estimate
 from agents.stein.landmarks import LandmarkFit, fit_landmarks
 from agents.stein.likelihood import Scale
@@ -79,7 +80,7 @@ class SteinViFilter(Localizer[SteinViBelief]):
         imu, landmarks = believed.sensor(Imu), believed.sensor(Landmarks)
         motion = believed.process
         if imu is None or landmarks is None or not isinstance(motion, Inertial):
-            raise ValueError("a team with an IMU, landmarks and inertial motion is needed")
+            raise NotServed("a team with an IMU, landmarks and inertial motion is needed")
         known = max(motion.accel_bias, _KNOWN), max(motion.gyro_bias, _KNOWN)
         motion = replace(motion, accel_bias=known[0], gyro_bias=known[1])
         process = self.process = InertialProcess(believed.arena.dt, imu, motion)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from agents.localizer import Estimate, Localizer
 from agents.particle.belief import normal, uniform
+from agents.registry import NotServed
 from agents.stein.likelihood import Scale
 from agents.tensorclasses import build
 from coloc_env.geometry import poses_in, rotate, rotation_matrix
@@ -34,9 +35,9 @@ class RelativeTeam(Localizer[B]):
         arena = believed.arena
         matches, odometry = believed.sensor(RelativePose), believed.sensor(Odometry)
         if matches is None or odometry is None or believed.sensor(Reference) is None:
-            raise ValueError("a team with relative poses, odometry and a reference is needed")
+            raise NotServed("a team with relative poses, odometry and a reference is needed")
         if believed.slots < arena.n_uavs:
-            raise ValueError(f"a team of {arena.n_uavs} needs as many slots, not {believed.slots}")
+            raise NotServed(f"a team of {arena.n_uavs} needs as many slots, not {believed.slots}")
         self.poses, self.matches, self.odometry = poses_in(arena.dim), matches, odometry
         self.outliers, self.anneal = outliers, anneal
         sides = [b - a for a, b in zip(arena.low, arena.high, strict=True)]

@@ -20,6 +20,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements
 from agents.models.process import make_process
+from agents.registry import NotServed
 from agents.swarm import joint
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.centres import Centres
@@ -78,7 +79,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         super().__init__(believed)
         ranging = believed.sensor(Ranging)
         if ranging is None:
-            raise ValueError("a team with ranges between UAVs is needed")
+            raise NotServed("a team with ranges between UAVs is needed")
         self.process = make_process(believed)
         self.navigation = NavigationFilter(believed, self.process)
         self.centres = Centres(believed, ranging)
@@ -89,7 +90,7 @@ class AnchoredTeam(Localizer[AnchoredBelief]):
         self.swarm = swarm
         self.variance = max(fixes.axis_std(self.process.dim)) ** 2
         if self.swarm.window:
-            raise ValueError("a window of steps is for teams without fixed anchors and lever arms")
+            raise NotServed("a window of steps is for teams without fixed anchors and lever arms")
         self.swarm.dense = False
         models = make_measurements(believed)
         self.biases = Biases([m for m in models if m.bias_std], self.process.dt)

@@ -11,6 +11,7 @@ from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import UavRanges
 from agents.models.process import make_process
+from agents.registry import NotServed
 from agents.swarm import calibration, delays, ins_bias, joint, joint_bias, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
@@ -63,7 +64,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
         super().__init__(believed)
         sensor = believed.sensor(Ranging)
         if sensor is None or sensor.tags:
-            raise ValueError("a team with ranges between UAVs, without lever arms, is needed")
+            raise NotServed("a team with ranges between UAVs, without lever arms, is needed")
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.range_models = [UavRanges(sensor)]
         self.confidence = CONFIDENCES[confidence](self.std)

@@ -2,9 +2,11 @@
 
 from typing import Any
 
-from agents.bank import Bank, BankOptions
+from agents.bank import BankOptions
+from agents.bank.kalman_fallback import KalmanFallback
 from agents.localizer import Localizer
 from agents.particle.apf import AdaptiveParticleFilter
+from agents.robust import Capped
 from agents.trust.screen import learned_screen
 from coloc_env.scenario import Believed
 
@@ -13,8 +15,8 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
     """Adaptive particle filter with learned trust in every landmark, bearing and range.
 
     The networks of ``ekf_trust`` judge by a Gaussian update at the cloud's moments; their weights
-    and biases enter every particle's likelihood. ``bank``, ``weights``: as ``ekf_trust`` has them;
-    other options as ``apf``.
+    and biases enter every particle's likelihood. ``bank``, ``weights``: as ``ekf_trust`` has them,
+    but that the branch beside the particles is ``ekf:robust=huber``; other options as ``apf``.
     """
 
     name = "pf_trust"
@@ -40,6 +42,9 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
         bank: BankOptions = BankOptions(),  # noqa: B008
         **options: Any,
     ) -> Localizer[Any]:
-        """The filter, or a bank of it and one with Huber's weights."""
+        """The filter, or a bank of it, its weights capped by Huber's, and a Kalman filter."""
         one = cls(believed, bank=bank, **options)
-        return Bank(one, bank) if bank.bank else one
+        if not bank.bank:
+            return one
+        one.screen = Capped(one.screen)
+        return KalmanFallback(one, bank, "trust_share")

@@ -49,7 +49,7 @@ _FUNCTIONS = {  # where a name is looked up: what its time is called
     "agents.trust.screen.features": "trust features",
     "agents.trust.screen.huber_weights": "Huber weights",
     "agents.bank.branches.huber_weights": "Huber weights",
-    "agents.bank.branches.predictive_score": "predictive score",
+    "agents.bank.scored.predictive_score": "predictive score",
 }
 _METHODS = {  # of a localizer and what it is made of
     "process.propagate": "prediction",

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 
 from agents.localizer import Localizer
+from agents.registry import NotServed
 from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from coloc_env.seeding import checked_seed
@@ -55,18 +56,26 @@ def evaluate(
 
     A run in which an agent's estimate is NaN or infinite, or that raises a numerical error, goes on
     with the last finite estimates (the prior before the first) and counts as diverged. An agent
-    that raises any other error has no metrics but that error, and the others go on; if all do, the
-    first one's error is raised.
+    that does not serve the team, or raises any other error, has no metrics but that error, and the
+    others go on; if all do, the first one's error is raised. Raises ValueError, before anything is
+    run, for a name or an option that is wrong, and if no agent serves the team.
     """
     _check(agents, runs, seed, chunk)
-    teams = {name: Team(name, scenario, device) for name in agents}
-    localizers = {name: team.localizer for name, team in teams.items()}
     truthful = tracked(scenario)
     units: list[Block | Bounded] = [Bounded(scenario, seed, runs)] if bound and truthful else []
     errors: dict[str, Exception] = {}
-    for name, team in teams.items():
+    localizers: dict[str, Localizer] = {}
+    teams = {name: Team(name, scenario, device) for name in agents}
+    for name, team in teams.items():  # what is wrong with any is known before one is tried
         try:
-            units += _blocks(team, seed, runs, chunk)
+            localizers[name] = team.localizer
+        except NotServed as error:
+            errors[name] = error
+    if not localizers:
+        raise errors[agents[0]]
+    for name in localizers:
+        try:
+            units += _blocks(teams[name], seed, runs, chunk)
         except Exception as error:
             errors[name] = error
     known: Bound | None = None
@@ -104,11 +113,7 @@ def evaluate(
         next(iter(records.values())).worlds,
         known,
         records,
-        {
-            name: f"{type(errors[name]).__name__}: {' '.join(str(errors[name]).split())}"
-            for name in agents
-            if name in errors
-        },
+        {name: _words(errors[name]) for name in agents if name in errors},
         {name: figures for name, (figures, _) in without_truth.items()},
     )
 
@@ -138,6 +143,12 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
     checked_seed(seed, "evaluate")
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk={chunk} is not allowed: at least 1")
+
+
+def _words(error: Exception) -> str:
+    """An error in one line; what a localizer says of a team that it does not serve is enough."""
+    kind = "" if isinstance(error, NotServed) else f"{type(error).__name__}: "
+    return kind + " ".join(str(error).split())
 
 
 def _blocks(team: Team, seed: int, runs: int, chunk: int | None) -> list[Block]:

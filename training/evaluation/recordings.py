@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.registry import make
+from agents.registry import NotServed, make
 from coloc_env.datasets import DATASETS, DataError, dataset_folder, sequences
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -81,7 +81,7 @@ def measure(
             continue
         try:
             localizer = make(agent, scenario)
-        except ValueError as error:
+        except NotServed as error:
             found[agent] = {"refused": str(error)}
             continue
         one = record(localizer, scenario, seeds)

@@ -18,6 +18,7 @@ from agents.models.measurements.differences import RangeDifferences
 from agents.models.measurements.flow import BodyVelocities
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
+from agents.registry import NotServed
 from coloc_env.scenario import (
     Believed,
     ConstantVelocity,
@@ -105,12 +106,12 @@ def make_measurements(believed: Believed) -> list[Measurement]:
         name, process = type(sensor).__name__, believed.process
         level = ConstantVelocity | InsDriven | DisplacementDriven
         if isinstance(sensor, _BODY_FRAME) and isinstance(process, level):
-            raise ValueError(f"{name} are in the body frame: the motion model has no attitude")
+            raise NotServed(f"{name} are in the body frame: the motion model has no attitude")
         if isinstance(sensor, SlowFlight) and isinstance(
             process, Wheeled | InsDriven | DisplacementDriven
         ):
             kind = type(process).__name__
-            raise ValueError(f"{name} is about velocity, which {kind} motion does not estimate")
+            raise NotServed(f"{name} is about velocity, which {kind} motion does not estimate")
     models = ((model_of(type(sensor)), sensor) for sensor in believed.sensors)
     return [model(sensor) for model, sensor in models if model is not None]
 

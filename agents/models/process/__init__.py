@@ -12,6 +12,7 @@ from agents.models.process.constant_velocity import ConstantVelocityProcess
 from agents.models.process.drifting import DriftingProcess
 from agents.models.process.inertial import InertialProcess
 from agents.models.process.reckoned import DisplacementProcess, InsProcess, WheeledProcess
+from agents.registry import NotServed
 from coloc_env import scenario as believed_processes
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Displacement, Height, Imu, Ins, Odometry, Sensor
@@ -59,21 +60,21 @@ def _process(believed: Believed) -> Process:
     if isinstance(settings, believed_processes.Inertial):
         imu = believed.sensor(Imu)
         if imu is None:
-            raise ValueError("the believed motion is inertial, but the team has no IMU")
+            raise NotServed("the believed motion is inertial, but the team has no IMU")
         return InertialProcess(arena.dt, imu, settings)
     if isinstance(settings, believed_processes.InsDriven):
         ins = believed.sensor(Ins)
         if ins is None:
-            raise ValueError("the believed motion is driven by an INS, but the team has none")
+            raise NotServed("the believed motion is driven by an INS, but the team has none")
         return InsProcess(arena.dim, arena.dt, ins, settings)
     if isinstance(settings, believed_processes.DisplacementDriven):
         displacement = believed.sensor(Displacement)
         if displacement is None:
-            raise ValueError("the believed motion is driven by displacements, but none is measured")
+            raise NotServed("the believed motion is driven by displacements, but none is measured")
         return DisplacementProcess(arena.dim, arena.dt, displacement)
     if isinstance(settings, believed_processes.Wheeled):
         odometry = believed.sensor(Odometry)
         if odometry is None:
-            raise ValueError("the believed motion is wheeled, but the team has no odometry")
+            raise NotServed("the believed motion is wheeled, but the team has no odometry")
         return WheeledProcess(arena.dt, odometry)
-    raise ValueError(f"{type(settings).__name__} motion has no model")
+    raise NotServed(f"{type(settings).__name__} motion has no model")

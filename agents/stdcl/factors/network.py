@@ -23,7 +23,7 @@ Output = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 class FactorNetwork(Learned):
     """Tensors in, tensors out, for teams of any size; with new weights all outputs are 0."""
 
-    kind = "stdcl_factors"
+    kind = "range_factors"
     features = (*LINKS, *NODES)
 
     def __init__(self, width: int = 20) -> None:

@@ -220,6 +220,26 @@ def test_one_agents_error_does_not_end_the_others(tmp_path: Path) -> None:
     assert "`test_still:wrong=missing` ended in an error" in (tmp_path / "out/table.md").read_text()
 
 
+def test_an_agent_that_does_not_serve_the_team_does_not_end_the_others(tmp_path: Path) -> None:
+    """``emvf`` where nothing is measured; a misspelt one beside it refuses everything at once."""
+    few = ("--set", "landmarks=0", "--no-bound", "--no-figures")
+    done = evaluate(tmp_path / "out", "--agents", "emvf,hpff,test_still", *few)
+    why = "emvf: what the team measures with Ranging would be ignored"
+    also = "hpff: the team has no distances to anchors to judge its filter by"
+    assert done.exit_code == 1
+    lines = done.stderr.splitlines()
+    assert lines[0].startswith(f"error: emvf has no results: {why}")
+    assert lines[1:] == [f"error: hpff has no results: {also}"]
+    agents = json.loads((tmp_path / "out" / "results.json").read_text())["agents"]
+    assert agents["test_still"]["rmse"] is not None
+    assert agents["emvf"]["rmse"] is None
+    assert agents["emvf"]["diagnostics"]["error"].startswith(why)
+    for wrong in ("emvf,ekff", "emvf,test_still:wrng=nan", "emvf", "emvf,pfnn:weights=non"):
+        done = evaluate(tmp_path / "none", "--agents", wrong, *few)
+        assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert not (tmp_path / "none").exists()
+
+
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "training.cli.command", *arguments]
 
@@ -293,7 +313,10 @@ def test_in_ci_a_task_that_is_done_is_a_line(
 def test_in_a_notebook_bars_are_a_widget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     widgets = ModuleType("ipywidgets")
-    monkeypatch.setitem(sys.modules, "ipywidgets", widgets)
+    display = ModuleType("IPython.display")  # the real one, outside a notebook, prints
+    for stands_in in (widgets, ModuleType("IPython"), display):
+        monkeypatch.setitem(sys.modules, stands_in.__name__, stands_in)
+    monkeypatch.setattr(display, "display", MagicMock(), raising=False)
     shown = MagicMock()
     monkeypatch.setattr(widgets, "Output", shown, raising=False)
     with progress() as bars:
