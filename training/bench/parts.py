@@ -58,8 +58,10 @@ _METHODS = {  # of a localizer and what it is made of
     "log_correction": "corrector network",
     "filter.screen.candidate.network.trust_vectors": "trust networks",
     "filter.screen.candidate.network.trust_ranges": "trust networks",
-    "filter.resampling.weigh": "weights",
-    "filter.resampling.resample_few": "resampling",
+    "candidate.screen.screen.screen.network.trust_vectors": "trust networks",
+    "candidate.screen.screen.screen.network.trust_ranges": "trust networks",
+    "candidate.resampling.weigh": "weights",
+    "candidate.resampling.resample_few": "resampling",
 }
 
 
