@@ -197,6 +197,7 @@ def test_a_cluster_that_dies_is_said_to_be_dead(tmp_path: Path) -> None:
     assert "run the command again" in done.stdout
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of libraries, as Python hides them
 @pytest.mark.parametrize(
     ("address", "words"),
     [
@@ -205,7 +206,7 @@ def test_a_cluster_that_dies_is_said_to_be_dead(tmp_path: Path) -> None:
         ("127.0.0.1:1", "nobody answers there; `ray start --head`"),
     ],
 )
-@pytest.mark.parametrize("command", ["evaluate", "reproduce"])
+@pytest.mark.parametrize("command", ["evaluate", "reproduce", "train", "bench"])
 def test_an_address_without_a_cluster(
     command: str, address: str, words: str, tmp_path: Path
 ) -> None:
@@ -222,8 +223,15 @@ def test_ray_that_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def _one_line(command: str, address: str, folder: Path) -> str:
-    what = ["indoor-v0", "--agents", "ekf"] if command == "evaluate" else ["cspf"]
-    words = [command, *what, "--out", str(folder / "out"), "--ray", address]
+    what = {"evaluate": ["indoor-v0", "--agents", "ekf"], "reproduce": ["cspf"], "bench": []}
+    words = [
+        command,
+        *what.get(command, ["nnhpff"]),
+        "--out",
+        str(folder / "out"),
+        "--ray",
+        address,
+    ]
     done = CliRunner().invoke(app, words)
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1

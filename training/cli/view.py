@@ -53,6 +53,8 @@ def view(
         runs = read(Path(what))
         with staged_file(out) as file:
             view_runs(runs, file)
+    elif Path(what).is_file():
+        raise ValueError(f"{what} is a file: a scenario's name or the folder of an evaluation")
     else:
         built = build_scenario(what, settings, threads, data)
         if not 1 <= steps <= built.horizon:

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from agents.wrappers.adapters import simple_spread
 from agents.wrappers.entries import replaced
+from agents.wrappers.localization import Localization
 
 N, HORIZON = 3, 25
 QUALITIES: dict[str, dict[str, Any] | None] = {
@@ -44,7 +45,8 @@ class Worlds:
     def __init__(self, count: int, quality: str, seed: int) -> None:
         self.envs = [simple_spread_v3.parallel_env(max_cycles=HORIZON) for _ in range(count)]
         self.names = self.envs[0].possible_agents
-        self.seed, self.overrides, self.team = seed, QUALITIES[quality], None
+        self.seed, self.overrides = seed, QUALITIES[quality]
+        self.team: Localization | None = None
 
     def reset(self) -> Tensor:
         """True observations [B, N, 18] of new episodes."""
@@ -157,7 +159,8 @@ def measured(policy: Policy, quality: str, worlds: int = 128) -> dict[str, float
     """Per agent and episode the mean return and number of steps in collision, the share of episodes
     that end with each landmark covered (an agent within 0.1, as mpe2 counts), and the mean
     localization error (m): in worlds that no training saw."""
-    env, true_return, hit, errors = Worlds(worlds, quality, 10_000), 0.0, 0.0, []
+    env, true_return, hit = Worlds(worlds, quality, 10_000), 0.0, 0.0
+    errors: list[float] = []
     true = env.reset()
     for _ in range(HORIZON):
         true, gained = env.step(policy(env.known(true)))

@@ -28,7 +28,7 @@ def test_a_quick_measurement_of_growth(tmp_path: Path) -> None:
 
 
 def test_memory_grows_with_particles() -> None:
-    sweep = Sweep("pf500", "particles", (100, 400), "pf500", overrides=(("n_uavs", 2),))
+    sweep = Sweep("pf500", "particles", (4000, 16000), "pf500", overrides=(("n_uavs", 2),))
     found = measure(sweep, torch.device("cpu"), 0.0)
     assert 3 < found["belief"][1] / found["belief"][0] < 4.1
     assert found["bytes"][1] > 2 * found["bytes"][0]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.tasks import TASKS, make_task
+from agents.tasks import TASKS, leaderboard, make_task
 from coloc_env.options import typed
 from training.evaluation.score import FIRST_SEED, WORLDS
 from training.learning import curves
@@ -133,12 +133,12 @@ def picture(found: Sequence[Recipe], known: Mapping[str, tuple[str, float]]) -> 
     return figure
 
 
-def heuristics(folder: Path) -> dict[str, tuple[str, float]]:
+def heuristics() -> dict[str, tuple[str, float]]:
     """The best heuristic of each task and its return, from the stored scores of the protocol."""
     found: dict[str, tuple[str, float]] = {}
     for name in TASKS:
         factory: Any = TASKS[name]
-        file = folder / name / f"{factory.best}.json"
+        file = leaderboard.FOLDER / name / f"{factory.best}.json"
         if file.exists():
             score = json.loads(file.read_text(encoding="utf-8"))
             found[name] = (factory.best, score["return"])
@@ -164,8 +164,7 @@ def main() -> None:
     ]
     (chosen.out.parent / "assets").mkdir(exist_ok=True)
     (chosen.out.parent / "assets" / f"{NAME}.json").write_text(json.dumps(each) + "\n")
-    known = heuristics(chosen.out / "scores")
-    picture(found, known).savefig(chosen.out.parent / "assets" / f"{NAME}.png", dpi=110)
+    picture(found, heuristics()).savefig(chosen.out.parent / "assets" / f"{NAME}.png", dpi=110)
 
 
 if __name__ == "__main__":
