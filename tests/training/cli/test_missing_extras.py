@@ -26,7 +26,8 @@ def test_a_command_names_the_extra(
     extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, words = COMMANDS[extra]
-    monkeypatch.setitem(sys.modules, module, None)
+    for name in (module, *(one for one in sys.modules if one.startswith(f"{module}."))):
+        monkeypatch.setitem(sys.modules, name, None)
     out = tmp_path / ("out.rrd" if extra == "view" else "out")
     done = CliRunner().invoke(app, [*words, "--out", str(out)])
     assert done.exit_code == 2
