@@ -87,8 +87,9 @@ class Bank(Localizer[BankBelief]):
         return *halves(rows), evidence, estimates
 
     def speaks(self, belief: BankBelief) -> Bool[Tensor, "B N"]:
-        """Where the candidate is the one that speaks (or spoke in the last step)."""
-        return candidate_speaks(belief)
+        """Where the candidate is the one that speaks (or spoke in the last step): the evidence is
+        for it, and it was not restarted in that step."""
+        return (belief.evidence >= 0) & ~belief.restarted
 
     def mean(self, belief: BankBelief) -> Float[Tensor, "B N S"]:
         ours, theirs = (self.filter.mean(one) for one in (belief.candidate, belief.fallback))
@@ -131,11 +132,6 @@ class Bank(Localizer[BankBelief]):
             "huber_share": (~speaks).float(),
             "restarts_per_run": belief.restarted.float(),
         }
-
-
-def candidate_speaks(belief: BankBelief) -> Bool[Tensor, "B N"]:
-    """Where the evidence is for the candidate, which was not restarted in the last step."""
-    return (belief.evidence >= 0) & ~belief.restarted
 
 
 def spoken(candidate: Bool[Tensor, "B N"], estimates: Estimate) -> Estimate:

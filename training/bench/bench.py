@@ -5,12 +5,9 @@ slows all alike; the figure is the best round, the median beside it shows how no
 """
 
 import json
-import math
 import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -24,7 +21,7 @@ from rich.table import Table
 
 from coloc_env.staging import staged_folder
 from training.bench.agents import TITLES, time_agents
-from training.bench.cases import Case, Timed, cases
+from training.bench.cases import cases
 from training.bench.figures import FIGURES, draw
 from training.bench.growth import growth
 from training.bench.growth_figures import device_figure, growth_figure
@@ -32,6 +29,7 @@ from training.bench.growth_tables import growth_table, study_cost
 from training.bench.learning import learning_cases
 from training.bench.on_device import on_device
 from training.bench.peers import peers
+from training.bench.rounds import rounds
 from training.bench.spread import spread, spread_table
 from training.pool import Workers
 
@@ -118,7 +116,8 @@ def run_bench(quick: bool = False, agents: bool = True) -> dict[str, Any]:
     """
     with _one_thread():
         chosen = [*cases(), *learning_cases(), *peers()]
-        environments = _rounds(chosen, 1 if quick else 15)
+        turns = _track(range(2 if quick else 16), "environments")
+        environments = rounds(chosen, turns)
         localizers = time_agents(quick, _track) if agents else {}
     best = {name: figures["agent_steps_per_s"] for name, figures in environments.items()}
     return {
@@ -177,33 +176,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _rounds(chosen: Sequence[Case], rounds: int) -> dict[str, dict[str, float]]:
-    """Time all cases in turn, round after round, once more than counted to warm up."""
-    ready = [(case, case.setup()) for case in chosen]
-    seconds: dict[str, list[float]] = {case.key: [] for case in chosen}
-    for _ in _track(range(rounds + 1), "environments"):
-        for case, timed in ready:
-            seconds[case.key].append(_seconds(case, timed))
-    found = {}
-    for case in chosen:
-        counted = seconds[case.key][1:]
-        best = min(counted)
-        found[case.key] = {
-            "agent_steps_per_s": case.agents / best,
-            "median": case.agents / statistics.median(counted),
-            "ms": 1e3 * best,
-        }
-    return found
-
-
-def _seconds(case: Case, timed: Timed) -> float:
-    """Mean time of a step over whole windows."""
-    steps = timed.window * math.ceil(case.steps / timed.window)
-    start = time.perf_counter()
-    timed.run(steps)
-    return (time.perf_counter() - start) / steps
 
 
 def _track(items: Sequence[T], what: str) -> Iterable[T]:

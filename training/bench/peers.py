@@ -17,7 +17,7 @@ def peers() -> Iterator[Case]:
         yield Case("mpe2 simple_spread", "B=1", N_AGENTS, 128, _mpe2)
     if importlib.util.find_spec("vmas"):
         for size, steps in ((1, 32), (32, 32), (1024, 8)):
-            yield Case("VMAS simple_spread", f"B={size}", N_AGENTS * size, steps, _vmas(size))
+            yield Case("VMAS simple_spread", f"B={size}", N_AGENTS * size, steps, vmas_worlds(size))
 
 
 def _mpe2() -> Timed:
@@ -34,20 +34,24 @@ def _mpe2() -> Timed:
     return Timed(run)
 
 
-def _vmas(size: int) -> Callable[[], Timed]:
+def vmas_worlds(
+    size: int, task: str = "simple_spread", agents: int = N_AGENTS
+) -> Callable[[], Timed]:
+    """Steps of so many worlds of one of VMAS's tasks, by agents that do nothing."""
+
     def setup() -> Timed:
         import vmas
 
         env = vmas.make_env(
-            "simple_spread",
+            task,
             num_envs=size,
             device="cpu",
             continuous_actions=True,
-            n_agents=N_AGENTS,
+            n_agents=agents,
             seed=0,
         )
         env.reset()
-        actions = [torch.zeros(size, 2) for _ in range(N_AGENTS)]
+        actions = [torch.zeros(size, 2) for _ in range(agents)]
 
         def run(steps: int) -> None:
             for _ in range(steps):

@@ -6,9 +6,7 @@
 import argparse
 import json
 import platform
-import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import date
 from itertools import islice
 from pathlib import Path
@@ -17,64 +15,54 @@ import torch
 
 from agents.tasks import TASKS, make_task, parallel_env
 from agents.tasks.runner import rollout
+from training.bench.cases import Case, Timed
+from training.bench.peers import vmas_worlds
+from training.bench.rounds import rounds
 
-WORLDS, STEPS, ROUNDS = 256, 15, 3
-Block = Callable[[], int]  # runs, and returns how many agent-steps it ran
-
-
-def batched(name: str) -> Block:
-    """Random actions in ``WORLDS`` worlds at once, the estimator in the loop."""
-    task = make_task(name)
-
-    def run() -> int:
-        steps = rollout(task, task.policies["random"], torch.arange(WORLDS))
-        return sum(step.action.shape[0] * step.action.shape[1] for step in islice(steps, STEPS))
-
-    return run
+WORLDS, STEPS, ROUNDS, PEERS = 256, 15, 3, 4  # PEERS: agents of VMAS's navigation
+BATCH, FACE = f"B={WORLDS}", "PettingZoo"
+NAMES = [name for name in TASKS if "hard" not in name]
 
 
-def one_world(name: str) -> Block:
-    """Random actions on the PettingZoo face."""
-    env = parallel_env(name)
-
-    def run() -> int:
-        env.reset(seed=0)
-        count = 0
-        for _ in range(STEPS):
-            count += len(env.agents)
-            env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-        return count
-
-    return run
+def task_cases() -> Iterator[Case]:
+    """Every task in the plane, many worlds at once and one on the PettingZoo interface; VMAS's."""
+    for name in NAMES:
+        n = make_task(name).n_agents
+        yield Case(name, BATCH, n * WORLDS, STEPS, batched(name))
+        yield Case(name, FACE, n, STEPS, one_world(name))
+    peer = vmas_worlds(WORLDS, "navigation", PEERS)
+    yield Case("VMAS navigation", BATCH, PEERS * WORLDS, STEPS, peer)
 
 
-def vmas_navigation(agents: int = 4) -> Block:
-    """VMAS's own task, as many worlds at once, actions all the same."""
-    import vmas
+def batched(name: str) -> Callable[[], Timed]:
+    """Random actions in ``WORLDS`` new worlds at once, the estimator in the loop."""
 
-    env = vmas.make_env("navigation", num_envs=WORLDS, device="cpu", n_agents=agents, seed=0)
-    actions = [torch.full((WORLDS, 2), 0.3) for _ in range(agents)]
+    def setup() -> Timed:
+        task = make_task(name)
 
-    def run() -> int:
-        env.reset()
-        for _ in range(STEPS):
-            env.step(actions)
-        return WORLDS * agents * STEPS
+        def run(steps: int) -> None:
+            for _ in islice(rollout(task, task.policies["random"], torch.arange(WORLDS)), steps):
+                pass
 
-    return run
+        return Timed(run)
+
+    return setup
 
 
-def measured(blocks: dict[str, Block]) -> dict[str, float]:
-    """Agent-steps a second of CPU time: medians of ``ROUNDS`` rounds, the blocks in turn, after one
-    that is not counted."""
-    rates: dict[str, list[float]] = {name: [] for name in blocks}
-    for counted in (False, *(True,) * ROUNDS):
-        for name, run in blocks.items():
-            start = time.process_time()
-            count = run()
-            if counted:
-                rates[name].append(count / (time.process_time() - start))
-    return {name: statistics.median(each) for name, each in rates.items()}
+def one_world(name: str) -> Callable[[], Timed]:
+    """Random actions in a new world on the PettingZoo interface."""
+
+    def setup() -> Timed:
+        env = parallel_env(name)
+
+        def run(steps: int) -> None:
+            env.reset(seed=0)
+            for _ in range(steps):
+                env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+
+        return Timed(run)
+
+    return setup
 
 
 def main() -> None:
@@ -82,24 +70,23 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the table, as pages take it")
     out = parser.parse_args().out
     torch.set_num_threads(1)
-    names = [name for name in TASKS if "hard" not in name]
-    blocks = {name: batched(name) for name in names}
-    blocks |= {f"{name}, PettingZoo": one_world(name) for name in names}
-    found = measured(blocks | {"VMAS": vmas_navigation()})
+    timed = rounds([*task_cases()], range(1 + ROUNDS))
+    found = {key: figures["median"] for key, figures in timed.items()}
+    peer = found[f"VMAS navigation {BATCH}"]
     rows = [
         [
             f"`{name}`",
             str(make_task(name).n_agents),
-            f"{found[name] / 1e3:.1f} k",
-            f"{found[name] / found['VMAS']:.2f}",
-            f"{found[f'{name}, PettingZoo'] / 1e3:.2f} k",
+            f"{found[f'{name} {BATCH}'] / 1e3:.1f} k",
+            f"{found[f'{name} {BATCH}'] / peer:.2f}",
+            f"{found[f'{name} {FACE}'] / 1e3:.2f} k",
         ]
-        for name in names
+        for name in NAMES
     ]
     table = {
         "title": "Agent-steps per second of tasks",
-        "caption": f"One thread, CPU time, estimator included, random actions: {WORLDS} worlds at "
-        f"once, the ratio to VMAS's navigation in as many ({found['VMAS'] / 1e3:.0f} k, without an "
+        "caption": f"One thread, estimator included, random actions: {WORLDS} worlds at "
+        f"once, the ratio to VMAS's navigation in as many ({peer / 1e3:.0f} k, without an "
         "estimator), and one world on the PettingZoo interface; medians, cases in turn.",
         "command": f"python -m training.bench.tasks --out {out}",
         "provenance": f"{platform.machine()}, {date.today().isoformat()}",

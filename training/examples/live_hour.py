@@ -109,7 +109,7 @@ def run(
         assert child.stdin
         reader = Thread(target=read, args=(child.stdout,))
         reader.start()
-        held, count, k, begun = [], 0, 0, time.monotonic()
+        held, count, k, start = [], 0, 0, time.monotonic()
         with suppress(KeyboardInterrupt):  # what there is until then
             for k in range(scenario.horizon):
                 truth[k] = world.truth.position[0].numpy()
@@ -120,7 +120,7 @@ def run(
                 if k % round(60 / dt) == round(30 / dt):  # once a minute
                     held.append(memory(child.pid))
                 world.advance(torch.zeros(1, N, 9))
-                time.sleep(max(0.0, begun + (k + 1) * dt / speed - time.monotonic()))
+                time.sleep(max(0.0, start + (k + 1) * dt / speed - time.monotonic()))
         child.stdin.close()
         reader.join()
         assert child.stderr
@@ -133,7 +133,7 @@ def run(
         "seconds": (k + 1) * dt,
         "dt": dt,
         "speed": speed,
-        "wall_s": time.monotonic() - begun,
+        "wall_s": time.monotonic() - start,
         "cpu_s": used.ru_utime + used.ru_stime,
         "events": count,
         "memory_mb": held,
