@@ -5,7 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_env.datasets.recording import Recording, Stamps, Table, Track
-from coloc_env.datasets.residuals import Link, best_delay, has_truth, links_of, robust, true_ranges
+from coloc_env.datasets.residuals import (
+    Link,
+    best_delay,
+    has_truth,
+    link_delay,
+    links_of,
+    robust,
+    true_ranges,
+)
 
 _GAPS = 10.0  # times the usual interval, and
 _GAP = 1.0  # s: longer than both is a gap
@@ -57,21 +65,22 @@ def check(recording: Recording) -> Report:
     for robot, name in enumerate(recording.robots):
         rows.append(_stream(name, "truth", recording.truth[robot]))
         rows += [_stream(name, stream, team[robot]) for stream, team in recording.streams.items()]
-    links = tuple(
-        report
-        for stream in ("anchor_ranges", "uav_ranges")
-        for link in links_of(recording, stream)
-        if (report := _link(recording, link)) is not None
-    )
     found = [*_about_time(recording, rows), *_about_imu(recording), *_about_reach(recording)]
-    found += [*_about_delays(recording), *_about_ranges(links)]
+    links: list[LinkReport] = []
+    for stream in ("anchor_ranges", "uav_ranges"):
+        known = [link for link in links_of(recording, stream) if has_truth(recording, link)]
+        common = best_delay(recording, known)
+        if abs(common) >= _LATE:
+            found.append((2, f"{stream}: stamps are {common:+.2f} s late (calibrate)"))
+        links += filter(None, (_link(recording, link, common) for link in known))
+    found += _about_ranges(links)
     found += [
         (5, f"{count} of {stream} are left out: no sensor can have measured them")
         for stream, count in recording.dropped.items()
         if count
     ]
     ordered = tuple(text for _, text in sorted(found, key=lambda each: each[0]))
-    return Report(tuple(row for row in rows if row.samples), links, ordered)
+    return Report(tuple(row for row in rows if row.samples), tuple(links), ordered)
 
 
 def _stream(robot: str, stream: str, table: Table | Track) -> StreamReport:
@@ -85,10 +94,8 @@ def _stream(robot: str, stream: str, table: Table | Track) -> StreamReport:
     return StreamReport(robot, stream, len(table.time), rate, longest, gaps, int((step == 0).sum()))
 
 
-def _link(recording: Recording, link: Link) -> LinkReport | None:
-    if not has_truth(recording, link):
-        return None
-    delay = best_delay(recording, [link])
+def _link(recording: Recording, link: Link, common: float) -> LinkReport | None:
+    delay = link_delay(recording, link, common)
     distance, known = true_ranges(recording, link, delay)
     error = (link.measured - distance)[known]
     if len(error) < 5:
@@ -195,18 +202,7 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     return found
 
 
-def _about_delays(recording: Recording) -> list[tuple[int, str]]:
-    """Streams of ranges whose stamps are late, all links together."""
-    found = []
-    for stream in ("anchor_ranges", "uav_ranges"):
-        known = [link for link in links_of(recording, stream) if has_truth(recording, link)]
-        delay = best_delay(recording, known)
-        if abs(delay) >= _LATE:
-            found.append((2, f"{stream}: stamps are {delay:+.2f} s late (calibrate)"))
-    return found
-
-
-def _about_ranges(links: tuple[LinkReport, ...]) -> list[tuple[int, str]]:
+def _about_ranges(links: list[LinkReport]) -> list[tuple[int, str]]:
     found = []
     for link in links:
         if abs(link.bias) > 1.0:

@@ -14,7 +14,8 @@ from coloc_env.datasets.recording import Flags, Floats, Recording, Stamps, Table
 _HOLE = 250_000_000  # ns between samples of truth that are bridged
 _FEW, _MANY = 20, 100  # ranges of a link, and of all, of fewer of which no delay is estimated
 _CHANGE = 1_000_000_000  # ns over which errors are watched change
-_FALLS = 0.95  # of a deviation: what a delay must make of it
+FALLS = 0.95  # of a deviation: what a delay must make of it
+_OWN = 0.8  # of the deviation with the others' delay: what is less shows that a link has its own
 _LATEST = 600_000_000  # ns, the largest delay that is looked for
 
 
@@ -145,6 +146,15 @@ def best_delay(recording: Recording, links: Sequence[Link]) -> float:
     return next(filter(None, (_least(recording, links, look) for look in (changes, spread))), 0.0)
 
 
+def link_delay(recording: Recording, link: Link, common: float) -> float:
+    """A link's own delay (s) where it explains its ranges far better than the others' does: of so
+    few ranges the best of many delays fits better by chance."""
+    own, by_chance = best_delay(recording, [link]), 3 * len(link.time) ** -0.5
+    if spread(recording, link, own) < min(_OWN, 1 - by_chance) * spread(recording, link, common):
+        return own
+    return common
+
+
 def _least(
     recording: Recording, links: Sequence[Link], look: Callable[[Recording, Link, float], float]
 ) -> float:
@@ -157,7 +167,7 @@ def _least(
         return 0.0
     whole = np.average(np.log(np.maximum(curves[known], 1e-4)), axis=0, weights=count[known])
     best = int(np.argmin(whole))
-    if not 0 < best < len(delays) - 1 or whole[best] > whole[len(delays) // 2] + np.log(_FALLS):
+    if not 0 < best < len(delays) - 1 or whole[best] > whole[len(delays) // 2] + np.log(FALLS):
         return 0.0
     left, middle, right = whole[best - 1 : best + 2]
     bend = left - 2 * middle + right

@@ -6,11 +6,17 @@ import numpy as np
 
 from coloc_env.datasets.noise_model import LinkModel, RangeModel
 from coloc_env.datasets.recording import Recording
-from coloc_env.datasets.residuals import Link, best_delay, has_truth, links_of, spread, true_ranges
+from coloc_env.datasets.residuals import (
+    Link,
+    best_delay,
+    has_truth,
+    link_delay,
+    links_of,
+    true_ranges,
+)
 from training.calibration.noise import Noise, noise_of, pooled, shrunk
 
 _FEW = 3  # ranges of a link that say anything
-_OWN = 0.8  # of the deviation with the others' delay: what is less shows that a link has its own
 
 
 def calibrate_ranges(
@@ -20,7 +26,7 @@ def calibrate_ranges(
     nothing to learn from."""
     links = [link for link in links_of(recording, stream) if has_truth(recording, link)]
     common = best_delay(recording, links)
-    delays = {link.name: _delay(recording, link, common) for link in links}
+    delays = {link.name: link_delay(recording, link, common) for link in links}
     found = {}
     for link in links:
         distance, known = true_ranges(recording, link, delays[link.name])
@@ -48,11 +54,3 @@ def less_systematic(recording: Recording, stream: str, model: RangeModel) -> lis
         time = link.time - round(own.delay * 1e9)
         found.append(replace(link, time=time, measured=link.measured - own.bias))
     return found
-
-
-def _delay(recording: Recording, link: Link, common: float) -> float:
-    """A link's own delay where it explains its ranges far better than the others' does."""
-    own = best_delay(recording, [link])
-    if spread(recording, link, own) < _OWN * spread(recording, link, common):
-        return own
-    return common

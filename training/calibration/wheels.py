@@ -7,8 +7,8 @@ from scipy.optimize import nnls
 
 from coloc_env.datasets.grid import Grid, odometry_on
 from coloc_env.datasets.noise_model import OdometryModel
-from coloc_env.datasets.recording import Floats, Recording, Table
-from coloc_env.datasets.residuals import pose_at
+from coloc_env.datasets.recording import Floats, Recording, Table, Track
+from coloc_env.datasets.residuals import FALLS, pose_at
 
 _DT = 0.1  # s, of the steps whose noise is estimated
 _WINDOW = 10  # steps over which displacements are compared
@@ -36,15 +36,16 @@ def calibrate_odometry(recording: Recording) -> OdometryModel | None:
     ]
     if not robots:
         return None
-    best, least, moved = 0.0, np.inf, None
-    for delay in _DELAYS:
-        each = _join([_compared(table, track, float(delay)) for table, track in robots])
-        if each is None:
-            return None
-        spread = _misfit(each)
-        if spread < least:
-            best, least, moved = float(delay), spread, each
-    assert moved is not None
+    delay, moved = 0.0, _all_compared(robots, 0.0)
+    if moved is None:
+        return None
+    # What a delay must bring the misfit below: steady motion shows none, and of n windows one fits
+    # better by up to 2/√n by chance.
+    least = min(FALLS, 1 - 2 * len(moved.read) ** -0.5) * _misfit(moved)
+    for other in _DELAYS:
+        each = _all_compared(robots, float(other))
+        if each is not None and (misfit := _misfit(each)) < least:
+            delay, least, moved = float(other), misfit, each
     scale, turn_scale = _scale(moved, 0), _scale(moved, 2)
     error = moved.true - moved.read * (scale, scale, turn_scale)
     lasted = _WINDOW * _DT
@@ -52,14 +53,21 @@ def calibrate_odometry(recording: Recording) -> OdometryModel | None:
     turn, skid = _noise(error[:, 2], moved.read[:, 2] / lasted, lasted)
     left, _ = _noise(error[:, 1], np.zeros(len(error)), lasted)
     relative = float(np.sqrt(0.5 * (slip**2 + skid**2)))
-    return OdometryModel(scale, turn_scale, best, forward, left, turn, relative)
+    return OdometryModel(scale, turn_scale, delay, forward, left, turn, relative)
 
 
-def _compared(table: Table, track: object, delay: float) -> _Moved | None:
+def _all_compared(robots: list[tuple[Table, Track]], delay: float) -> _Moved | None:
+    """Displacements of all robots; None where none has truth for long enough."""
+    each = [_compared(table, track, delay) for table, track in robots]
+    there = [moved for moved in each if moved is not None]
+    if not there:
+        return None
+    read, true = (np.concatenate([getattr(m, name) for m in there]) for name in ("read", "true"))
+    return _Moved(read, true)
+
+
+def _compared(table: Table, track: Track, delay: float) -> _Moved | None:
     """Displacements of one robot over windows in which it has truth."""
-    from coloc_env.datasets.recording import Track
-
-    assert isinstance(track, Track)
     start = max(track.time[0], table.time[0] + 10**9)
     end = min(track.time[-1], table.time[-1] - 10**9)
     count = int((end - start) * 1e-9 / _DT)
@@ -89,15 +97,6 @@ def _composed(steps: Floats) -> Floats:
         x, y, turn = steps[:, i].T
         total += np.stack((c * x - s * y, s * x + c * y, turn), 1)
     return total
-
-
-def _join(parts: list[_Moved | None]) -> _Moved | None:
-    there = [part for part in parts if part is not None]
-    if not there:
-        return None
-    return _Moved(
-        np.concatenate([part.read for part in there]), np.concatenate([part.true for part in there])
-    )
 
 
 def _misfit(moved: _Moved) -> float:

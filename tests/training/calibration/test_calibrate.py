@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coloc_env.datasets.check import check
 from coloc_env.datasets.corrections import corrected
 from coloc_env.datasets.noise_model import read_noise_model, write_noise_model
 from coloc_env.datasets.open_format import write_recording
@@ -15,6 +16,7 @@ from training.calibration.calibrate import calibrate, part_of
 from training.calibration.inertial import allan, allan_of, standing
 from training.calibration.noise import Noise, noise_of, shrunk, whitened
 from training.calibration.smoother import smoothed
+from training.calibration.wheels import calibrate_odometry
 
 DELAY, SCALE, TURN_SCALE = 0.12, 0.93, 1.05
 BIASES = (0.05, 0.15, 0.25, 0.10)
@@ -211,3 +213,50 @@ def test_a_part_of_a_recording(tmp_path: Path) -> None:
     assert part.truth[0].time[0] == 10_000_000_000
     assert part.truth[0].time[-1] == 20_000_000_000
     write_recording(part, tmp_path / "part")
+
+
+def circled(seed: int = 0) -> Recording:
+    """Three robots on circles of constant speed, each of whose ranges to four anchors come every
+    0.3 s, for 30 s, on time; wheels that read the truth."""
+    rng = np.random.default_rng(seed)
+    dense = (np.arange(601) * 50_000_000).astype(np.int64)
+    anchors = np.array([[-5.0, -5], [5, -5], [5, 5], [-5, 5.0]])
+
+    def place(at: np.ndarray, robot: int) -> np.ndarray:
+        angle = 0.2 * at * 1e-9 + 2.1 * robot
+        return 3 * np.stack((np.cos(angle), np.sin(angle)), 1)
+
+    truth, wheels, ranges = [], [], []
+    for robot in range(3):
+        heading = 0.2 * dense * 1e-9 + 2.1 * robot + np.pi / 2
+        truth.append(Track(dense, place(dense, robot), heading[:, None]))
+        read = np.tile((0.6, 0.2), (len(dense), 1)) + rng.normal(size=(len(dense), 2)) * 0.01
+        wheels.append(Table(dense, read, ("v", "omega")))
+        time = np.repeat((np.arange(100) * 300_000_000).astype(np.int64), 4)
+        which = np.tile(np.arange(4), 100)
+        distance = np.linalg.norm(place(time, robot) - anchors[which], axis=1)
+        distance += rng.normal(size=len(time)) * 0.1
+        values = np.column_stack((np.zeros(len(time)), which, distance))
+        ranges.append(Table(time, values, ("own_tag", "anchor", "range")))
+    return Recording(
+        name="made",
+        dim=2,
+        robots=("a", "b", "c"),
+        truth=tuple(truth),
+        streams={"odometry": tuple(wheels), "anchor_ranges": tuple(ranges)},
+        landmarks=np.empty((0, 2)),
+        anchors=anchors,
+        tags=np.empty((3, 0, 2)),
+        source="made",
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_is_on_time_has_no_delay(seed: int) -> None:
+    """A hundred ranges a link fit best at some delay by chance; a steady circle shows none of the
+    wheels'. The check and the calibration say the same."""
+    recording = circled(seed)
+    assert {link.delay for link in check(recording).links} == {0.0}
+    wheels = calibrate_odometry(recording)
+    assert wheels is not None
+    assert wheels.delay == 0.0
