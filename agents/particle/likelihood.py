@@ -114,7 +114,7 @@ def log_likelihood(
         trust = _per_particle(trust, total.dtype)
         variance = block.total_variance
         squared = trust.residual(block) ** 2 / variance
-        if block.partner_variance is not None:
+        if block.partner_variance is not None or block.varies:
             squared = squared + variance.log()
         if trust.weight is not None:
             squared = squared * trust.weight.unsqueeze(-1)
