@@ -50,9 +50,9 @@ def _ultrasonic(
 
 @own_information.register
 def _magnetic(sensor: Magnetic, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
-    """z = Rᵀ B(p) + N(0, σ² I), with the slope of the map for that of the field."""
+    """z = Rᵀ B(p) + N(0, σ² I)."""
     rotation = rotation_matrix(truth.attitude)
-    field, slope = sensor.field(seen["magnetic_map"].double(), truth.position)
+    field, slope = sensor.field(truth.position)
     turned = cross_matrix((rotation.mT @ field.unsqueeze(-1))[..., 0])  # [Rᵀ B]×
     rows = torch.cat((rotation.mT @ slope, turned), -1)
     return _gram(rows, seen["magnetic_mask"].double() / max(sensor.std, EXACT) ** 2)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import cross_matrix, rotation_matrix
-from coloc_env.geometry.rays import first_surface
+from coloc_env.geometry.rays import corner_curvature, first_surface
 from coloc_env.motion import Box
 from coloc_env.options import Group, Metres, PositiveMetres, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
@@ -66,6 +66,13 @@ class Ultrasonic(Sensor):
         turned = -rotation.unsqueeze(-3) @ cross_matrix(axes)
         by_turn = (by_beam.unsqueeze(-2) @ turned)[..., 0, :]
         return distance, torch.cat((by_place, by_turn), -1)
+
+    def curvature(
+        self, position: Float[Tensor, "*s 3"], rotation: Float[Tensor, "*s 3 3"]
+    ) -> Float[Tensor, "*s 6"]:
+        """What stands for second derivatives (1/m) where beams go from one wall to the next."""
+        beams = rotation.new_tensor(BEAMS) @ rotation.mT
+        return corner_curvature(position.unsqueeze(-2), beams, self.room)
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion = window.motion

@@ -34,7 +34,7 @@ class MappedFields(Measurement):
     ) -> Block:
         rotation, turn = body_frame(process, x, "the field is")
         z, mask = usable(observation["magnetic"].unsqueeze(-2), observation[self.mask_leaf] > 0)
-        field, slope = self.sensor.field(observation["magnetic_map"], x[..., :3])
+        field, slope = self.sensor.mapped(x[..., :3])
         seen = (rotation.mT @ field.unsqueeze(-1))[..., 0]  # Rᵀ B
         residual = z.to(x.dtype) - seen.unsqueeze(-2)
         jacobian, curvature = x.new_zeros(0), None

@@ -32,13 +32,15 @@ class WallDistances(Measurement):
         )
         expected, by_pose = self.sensor.expected(x[..., :3], rotation)
         residual = z.to(x.dtype) - expected.unsqueeze(-1)
-        jacobian = x.new_zeros(0)
+        jacobian, curvature = x.new_zeros(0), None
         if derivatives:
             jacobian = x.new_zeros(*residual.shape, process.error_size)
             jacobian[..., 0, :3], jacobian[..., 0, turn] = by_pose[..., :3], by_pose[..., 3:]
+            curvature = self.sensor.curvature(x[..., :3], rotation).unsqueeze(-1)
         return Block(
             residual=residual,
             jacobian=jacobian,
             variance=x.new_tensor(self.variance).expand_as(residual),
             mask=mask,
+            curvature=curvature,
         )

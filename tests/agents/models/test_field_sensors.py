@@ -125,9 +125,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "flow": ("ekf", {"gnss": True, "flow": True}),
     "barometer": ("ekf", {"tdoa_anchors": 8, "barometer": True}),
     "angles": ("ekf_joint", {"anchors": 8, "angles": True}),
-    "lamps": ("ekf", {"light": True, "anchors": 8}),
-    "signal strength": ("ekf", {"rssi": True, "anchors": 8, "motion": "random"}),
-    "ultrasound": ("ekf", {"ultrasonic": True, "anchors": 8, "motion": "random"}),
 }
 
 
@@ -208,11 +205,6 @@ EVERYTHING: dict[str, Any] = {
     "gnss_outage": 0.3,
     "flow": True,
     "barometer": True,
-    "compass": True,
-    "light": True,
-    "rssi": True,
-    "ultrasonic": True,
-    "magnetic": True,
 }
 QUICK = (
     *("ekf", "ekf:fusion=ci", "ekf:fusion=pairwise", "ekf:robust=huber+gate", "ekf_joint"),

@@ -54,7 +54,8 @@ def ultrasonic(s: Ultrasonic, p: Kinematics, seen: Observation) -> tuple[Tensor,
 
 
 def magnetic(s: Magnetic, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
-    nodes = seen["magnetic_map"][0, 0].double().view(*s.nodes, 3)
+    grid = torch.cartesian_prod(*(torch.arange(n).double() for n in s.nodes))
+    nodes = s.field(grid)[0].view(*s.nodes, 3)
     found = []
     for i in range(N):
         x = p.position[0, i]

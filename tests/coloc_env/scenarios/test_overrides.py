@@ -114,6 +114,7 @@ CARRIED: dict[str, Any] = {
     "anomaly_length": 3.0,
     "magnetic_map_std": 2.0,
     "magnetic_map_time": 2.0,
+    "building": 3,
     "magnetic_dropout": 0.5,
 }
 IN_THE_WAY = (11.0, 9.0, 0.0, 11.5, 11.0, 5.0)
@@ -252,7 +253,11 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **{n: {"rssi": True} for n in CARRIED if n.startswith(("rssi_", "access"))},
         "rssi_wall_loss": {"rssi": True, "walls": IN_THE_WAY},
         **{name: {"ultrasonic": True} for name in CARRIED if name.startswith("ultrasonic_")},
-        **{n: {"magnetic": True} for n in CARRIED if n.startswith(("magnetic_", "anomaly_"))},
+        **{
+            n: {"magnetic": True}
+            for n in CARRIED
+            if n.startswith(("magnetic_", "anomaly_", "build"))
+        },
         "gnss_outage_time": {"gnss": True, "gnss_outage": 0.5},
     },
     "wsn-v0": {**RANGES_WITH, **FAILING, "kidnapped": {"kidnap_at": 0.2, "n_uavs": 2}},
