@@ -118,7 +118,10 @@ def log_likelihood(
             squared = squared + variance.log()
         if trust.weight is not None:
             squared = squared * trust.weight.unsqueeze(-1)
-        total = total - 0.5 * squared.sum(-1).masked_fill(~block.mask, 0.0).sum(-1)
+        log_density = -0.5 * squared.sum(-1)
+        if block.stray:
+            log_density = (log_density.exp() + block.stray).log()
+        total = total + log_density.masked_fill(~block.mask, 0.0).sum(-1)
     return total
 
 

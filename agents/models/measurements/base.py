@@ -66,6 +66,7 @@ class Block:
     ``per_slot``) flattened, and ``mutual``: both UAVs hold the very same number.
     ``distance`` (m) is that to the other UAV where it is what was measured. ``curvature``: the size
     (Frobenius norm) of ∂²h/∂p², per m², of what is far from linear while positions are broad.
+    ``stray``: the density of measurements that show something else, over that at the peak.
     ``varies``: the variance depends on the state, so that a likelihood counts its logarithm.
     """
 
@@ -80,6 +81,7 @@ class Block:
     distance: Float[Tensor, "B N m 1"] | None = None
     curvature: Float[Tensor, "B N m k"] | None = None
     varies: bool = False
+    stray: float = 0.0
 
     @property
     def total_variance(self) -> Float[Tensor, "B N m k"]:

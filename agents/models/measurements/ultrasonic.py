@@ -1,5 +1,7 @@
 """Distances to the nearest walls along the body's axes."""
 
+import math
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -9,6 +11,8 @@ from coloc_env.observation import Observation
 from coloc_env.sensors import Ultrasonic
 from coloc_env.sensors.base import usable
 
+_STRAY = 0.05  # of echoes that are believed to come from anywhere within reach
+
 
 class WallDistances(Measurement):
     """z = t + noise, t the distance along each beam R e to the first surface of a known room."""
@@ -17,6 +21,7 @@ class WallDistances(Measurement):
 
     def __init__(self, sensor: Ultrasonic) -> None:
         self.sensor, self.variance = sensor, noise_std(sensor.std) ** 2
+        self.stray = _STRAY * (2 * math.pi * self.variance) ** 0.5 / sensor.reach
 
     def linearize(
         self,
@@ -43,4 +48,5 @@ class WallDistances(Measurement):
             variance=x.new_tensor(self.variance).expand_as(residual),
             mask=mask,
             curvature=curvature,
+            stray=self.stray,
         )

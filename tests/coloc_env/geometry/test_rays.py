@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from coloc_env.geometry.rays import first_surface
+from coloc_env.geometry.rays import corner_curvature, first_surface
 
 ROOM = ((0.0, 0.0, 0.0), (6.0, 4.0, 3.0))
 BOXES = (((2.0, 1.0, 0.0), (3.0, 2.0, 2.0)), ((4.0, 0.0, 1.0), (4.5, 3.0, 3.0)))
@@ -57,3 +57,25 @@ def test_derivatives_are_those_of_the_distance() -> None:
             ]
             change = (ends[0] - ends[1]) / 2e-6
             torch.testing.assert_close(change[steep], by[steep, axis], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("std", [0.05, 0.3])
+def test_corners_count_about_what_linearizing_neglects(std: float) -> None:
+    """½ (c σ²)² against sampling, for points of the room: seldom less, where a third wall or the
+    point's own wall matters too, and next to nothing far from corners."""
+    origin, way = rays(300)
+    distance, slope = first_surface(origin, way, ROOM)
+    g = torch.Generator().manual_seed(1)
+    delta = std * torch.randn(1000, len(origin), 3, generator=g, dtype=torch.float64)
+    moved = origin + delta
+    within = inside(moved, ROOM)
+    there, _ = first_surface(moved, way, ROOM)
+    left = (there - distance - (slope * delta).sum(-1)).square()
+    found = torch.where(within, left, 0.0).sum(0) / within.sum(0)
+    counted = 0.5 * (corner_curvature(origin, way, ROOM) * std**2) ** 2
+    near = found > 0.01 * std**2
+    assert 0.05 < float(near.double().mean()) < 0.4
+    assert 0.3 < float((found / counted)[near].median()) < 1
+    assert float((found > 1.2 * counted + 1e-12).double().mean()) < (0.03 if std < 0.1 else 0.2)
+    upright = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    assert float(corner_curvature(origin[:1], upright, ROOM)) < 1e-6
