@@ -38,8 +38,8 @@ def corner_curvature(
     origin: Float[Tensor, "*#s 3"], direction: Float[Tensor, "*#s 3"], room: Box
 ) -> Float[Tensor, "*s"]:
     """What stands for a second derivative (1/m) of the distance to a room's walls, which is a
-    minimum of linear functions: c such that ½ (c σ²)² is about the most that linearizing neglects of
-    it for points that are uncertain by σ (m) an axis.
+    minimum of linear functions: c such that ½ (c σ²)² is about the most that linearizing neglects
+    of it for points that are uncertain by σ (m) an axis.
 
     If the next wall is g farther, and that gap changes by s = ‖∇g‖ σ, what is neglected is (e − g)₊
     with e ~ N(0, s²): of mean square s² ((1 + k²) Φ(−k) − k φ(k)), k = g / s (Clark 1961), which is
