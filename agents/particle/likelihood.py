@@ -114,11 +114,14 @@ def log_likelihood(
         trust = _per_particle(trust, total.dtype)
         variance = block.total_variance
         squared = trust.residual(block) ** 2 / variance
-        if block.partner_variance is not None:
+        if block.partner_variance is not None or block.varies:
             squared = squared + variance.log()
         if trust.weight is not None:
             squared = squared * trust.weight.unsqueeze(-1)
-        total = total - 0.5 * squared.sum(-1).masked_fill(~block.mask, 0.0).sum(-1)
+        log_density = -0.5 * squared.sum(-1)
+        if block.stray:
+            log_density = (log_density.exp() + block.stray).log()
+        total = total + log_density.masked_fill(~block.mask, 0.0).sum(-1)
     return total
 
 

@@ -11,18 +11,23 @@ from coloc_env.scenario import (
     Scenario,
     TeamOptions,
 )
-from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions
+from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, access_points
 from coloc_env.sensors import (
     AngleOptions,
     BarometerOptions,
+    CompassOptions,
     FlowOptions,
     GnssOptions,
     LandmarkOptions,
+    LightOptions,
+    MagneticOptions,
     Ranging,
+    RssiOptions,
     Sensor,
     SimulatedImuOptions,
     TagOptions,
     UavRangeOptions,
+    UltrasonicOptions,
 )
 
 
@@ -44,6 +49,11 @@ def indoor(
     gnss: GnssOptions = GnssOptions(),
     flow: FlowOptions = FlowOptions(),
     barometer: BarometerOptions = BarometerOptions(),
+    compass: CompassOptions = CompassOptions(),
+    light: LightOptions = LightOptions(),
+    rssi: RssiOptions = RssiOptions(),
+    ultrasonic: UltrasonicOptions = UltrasonicOptions(),
+    magnetic: MagneticOptions = MagneticOptions(),
     imu: SimulatedImuOptions = SimulatedImuOptions(),
     network: WalledNetworkOptions = WalledNetworkOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
@@ -77,8 +87,12 @@ def indoor(
     true += tdoa.true(room, arms)
     believed += tdoa.believed(room, arms)
     others = (*angles.true, *gnss.true(team.n_uavs), *flow.true, *barometer.true)
-    true += others
-    believed += others
+    senses = (
+        *(*compass.true, *light.true(room, radio.walls), *access_points(rssi, room, radio.walls)),
+        *(*ultrasonic.true(room, radio.walls), *magnetic.true(room)),
+    )
+    true += (*others, *senses)
+    believed += (*others, *senses)
     return Scenario(
         name="indoor-v0",
         arena=arena,
