@@ -16,6 +16,7 @@ from coloc_env.sensors.position_fix import AnchorUavOptions, GnssOptions, Positi
 from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRangeOptions
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
+from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
 
@@ -55,6 +56,8 @@ __all__ = [
     "RelativePose",
     "RelativePoseOptions",
     "Sensor",
+    "Sight",
+    "SightOptions",
     "SimulatedImuOptions",
     "SlowFlight",
     "TagOptions",
