@@ -80,8 +80,9 @@ class RangeNoise:
         self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
     ) -> Bool[Tensor, "R K *l"] | None:
         """Which of the numbered links are in an outage, ``latency`` steps before each of the
-        window's; None where none ever is. An outage of the team has no stream of its own: what
-        takes it is the same for all ranges."""
+        window's; None where none ever is. One of the team is the same for ranges of all kinds."""
+        if not self.outage and self.off is None:
+            return None
         dt, found = window.layout.arena.dt, None
         steps = window.steps - latency
         if self.outage:
