@@ -31,6 +31,7 @@ from coloc_env.sensors import (
     FlowOptions,
     GnssOptions,
     LandmarkOptions,
+    MapOptions,
     Ranging,
     Sensor,
     SightOptions,
@@ -50,6 +51,7 @@ def indoor(
     uwb: bool = True,
     team: TeamOptions = TeamOptions(),
     landmarks: LandmarkOptions = LandmarkOptions(),
+    mapping: MapOptions = MapOptions(),
     ranges: UavRangeOptions = UavRangeOptions(),
     anchors: AnchorOptions = AnchorOptions(),
     tags: TagOptions = TagOptions(),
@@ -88,8 +90,8 @@ def indoor(
         true.append(imu.true)
         believed.append(imu.believed)
         process = Inertial(imu.accel_bias, imu.gyro_bias) if imu.estimated else Inertial()
-    true += landmarks.behind(inside)
-    believed += landmarks.believed
+    true += mapping.of(landmarks.behind(inside))
+    believed += mapping.of(landmarks.believed)
     arms = tags.arms(team.n_uavs)
     if uwb:
         true.append(Ranging(ranges.true, arms, ranges.uwb_delay, sight=inside))

@@ -19,6 +19,7 @@ from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, Relativ
 from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
+from coloc_env.sensors.unmapped import MapOptions, UnmappedLandmarks
 
 __all__ = [
     "GRAVITY",
@@ -41,6 +42,7 @@ __all__ = [
     "Landmarks",
     "Layout",
     "Leaf",
+    "MapOptions",
     "NlosKind",
     "Odometry",
     "OpticalFlow",
@@ -64,5 +66,6 @@ __all__ = [
     "Tdoa",
     "UavBearings",
     "UavRangeOptions",
+    "UnmappedLandmarks",
     "Window",
 ]
