@@ -123,6 +123,7 @@ CHANGED: dict[str, dict[str, Any]] = {
         "gyro_bias": 0.9,
         "believed_imu_bias": True,
         "max_neighbours": 2,
+        "landmarks_known": False,
         "walls": PILLAR,
         "wall_delay": 2.0,
         "wall_std": 0.9,

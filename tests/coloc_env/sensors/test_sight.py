@@ -172,7 +172,8 @@ def test_outages_of_a_team_take_all_ranges_at_once() -> None:
     out = outages(0.4, 2.0, "team", 30, 60, 5)
     assert bool((out == out[..., :1]).all())
     assert 0 < float(out.double().mean()) < 1
-    run = episode(2, 30, n_uavs=3, uwb_outage=0.5, uwb_outage_time=0.5, uwb_outage_of="team", anchors=3)
+    outage = {"uwb_outage": 0.5, "uwb_outage_time": 0.5, "uwb_outage_of": "team"}
+    run = episode(2, 30, n_uavs=3, anchors=3, **outage)
     between, anchors = run["range_mask"].sum((-1, -2)), run["anchor_range_mask"].sum((-1, -2))
     assert set(between.unique().tolist()) == {0.0, 6.0}
     assert torch.equal(between > 0, anchors > 0)
