@@ -4,9 +4,9 @@ from coloc_env.motion import MOTIONS, Arena, ControlOptions, KidnapOptions, Moti
 from coloc_env.network import WalledNetworkOptions
 from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds, PositiveSpeed
 from coloc_env.scenario import (
+    AttitudePriorOptions,
     ConstantVelocity,
     Inertial,
-    PriorOptions,
     Process,
     Scenario,
     TeamOptions,
@@ -48,7 +48,7 @@ def indoor(
     network: WalledNetworkOptions = WalledNetworkOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
     control: ControlOptions = ControlOptions(),
-    prior: PriorOptions = PriorOptions(),
+    prior: AttitudePriorOptions = AttitudePriorOptions(),
 ) -> Scenario:
     """UAVs in a room, with an IMU, landmarks seen as body-frame vectors, and UWB between all UAVs.
 
@@ -65,8 +65,8 @@ def indoor(
         true.append(imu.true)
         believed.append(imu.believed)
         process = Inertial(imu.accel_bias, imu.gyro_bias) if imu.estimated else Inertial()
-    true += landmarks.true
-    believed += landmarks.believed
+    true += landmarks.named(landmarks.true)
+    believed += landmarks.named(landmarks.believed)
     arms = tags.arms(team.n_uavs)
     if uwb:
         true.append(Ranging(ranges.true, arms, ranges.uwb_delay))
@@ -86,7 +86,7 @@ def indoor(
         motion=control.of(kidnap.of(MOTIONS[motion], dt), v_max, radio.walls),
         sensors=tuple(true),
         network=radio,
-        prior=prior.at_start(),
+        prior=prior.with_attitude(),
         process=process,
         believed_sensors=tuple(believed),
         failure_rate=team.failure_rate,

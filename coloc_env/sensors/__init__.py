@@ -18,6 +18,7 @@ from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
+from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
 
 __all__ = [
     "GRAVITY",
@@ -61,5 +62,6 @@ __all__ = [
     "Tdoa",
     "UavBearings",
     "UavRangeOptions",
+    "UnlabelledLandmarks",
     "Window",
 ]

@@ -39,6 +39,7 @@ from coloc_env.sensors import (
     SlowFlight,
     Tdoa,
     UavBearings,
+    UnlabelledLandmarks,
 )
 from coloc_env.sensors.base import usable
 
@@ -82,8 +83,16 @@ MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     SlowFlight: Slowness,
     Tdoa: RangeDifferences,
     UavBearings: UavRangeBearings,
+    UnlabelledLandmarks: LandmarkVectors,
 }
-_BODY_FRAME = (ArrivalAngles, Landmarks, LandmarkBearings, OpticalFlow, UavBearings)
+_BODY_FRAME = (
+    ArrivalAngles,
+    Landmarks,
+    LandmarkBearings,
+    OpticalFlow,
+    UavBearings,
+    UnlabelledLandmarks,
+)
 
 
 def measures(sensor: type[Sensor]) -> Callable[[_M], _M]:

@@ -1,0 +1,5 @@
+"""Which landmark is seen, where measurements do not say: data association for every filter."""
+
+from agents.association.naming import METHODS, Association, AssociationName, associated
+
+__all__ = ["METHODS", "Association", "AssociationName", "associated"]
