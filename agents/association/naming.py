@@ -1,7 +1,7 @@
 """Names for landmarks that were seen without: what comes after works as if they had come so."""
 
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Int64
@@ -19,7 +19,6 @@ from coloc_env.scenario import Believed
 from coloc_env.sensors import UnlabelledLandmarks
 
 AssociationName = Literal["nearest", "joint"]
-METHODS: tuple[str, ...] = get_args(AssociationName)
 _BEAMS = 8  # partial sets of pairings that the search for joint compatibility keeps
 
 

@@ -43,11 +43,12 @@ FusionName = Literal["naive", "ci", "pairwise", "exchange"]
 class CooperativeEkf(GaussianFilter):
     """Cooperative error-state EKF, one per UAV, fed by neighbours' messages.
 
-    ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration;
-    ``gate`` drops innovations outside the χ² quantile ``gate``, ``ransac`` landmarks that do not
-    agree with most others, ``temporal`` what does not agree with the last two steps, ``cross`` what
-    neighbours' measurements contradict. ``iterations`` of each update. ``cooperate=false`` leaves
-    other UAVs out. ``association`` of landmarks that come without names: each with its ``nearest``
+    ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration
+    (or ``student``, t with ν = 4, or ``mixture``, of two Gaussians); ``gate`` drops innovations
+    outside the χ² quantile ``gate``, ``ransac`` landmarks that do not agree with most others,
+    ``temporal`` what does not agree with the last two steps, ``cross`` what neighbours'
+    measurements contradict. ``iterations`` of each update. ``cooperate=false`` leaves other UAVs
+    out. ``association`` of landmarks that come without names: each with its ``nearest``
     neighbour, or all with those that are ``joint``ly compatible, within the χ² quantile ``gate``.
 
     ``fusion`` of what involves neighbours: ``naive``, as if their errors were independent; ``ci``,

@@ -154,8 +154,8 @@ class Landmarks(Sensor):
     def _mistaken(
         self, window: Window
     ) -> tuple[Float32[Tensor, "R K N L"], Float32[Tensor, "R K N L"]]:
-        """Numbers in (0, 1): the landmark is taken for another where the first is below the share of
-        false matches; for which one, the second says."""
+        """Numbers in (0, 1): where the first is below the share of false matches the landmark is
+        taken for another, which the second chooses."""
         n = window.layout.arena.n_uavs
         if self.alias_time is None:
             draws = noise.uniform(window.keys, "landmarks.false", 2 * n * self.count)
@@ -169,8 +169,8 @@ class Landmarks(Sensor):
 
 
 def _half_turned(points: Float64[Tensor, "R L d"], layout: Layout) -> Float64[Tensor, "R L d"]:
-    """Every second point where half a turn about the arena's vertical axis takes the one before; the
-    last of an odd number on that axis."""
+    """Every second point where half a turn about the arena's vertical axis takes the one before;
+    the last of an odd number on that axis."""
     arena = layout.arena
     ends = zip(arena.low[:2], arena.high[:2], strict=True)
     centre = points.new_tensor([0.5 * (low + high) for low, high in ends])
@@ -206,14 +206,14 @@ class LandmarkOptions(Group):
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
-        """The sensor as it is, by landmarks with names; nothing without landmarks."""
+        """The sensor as it is, by landmarks with names."""
         wrong = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
         lasting, where = self.alias_time, self.landmark_placement
         return tuple(replace(one, alias_time=lasting, placement=where) for one in wrong)
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:
-        """The sensor that the team believes in, by landmarks with names; nothing without landmarks."""
+        """The sensor that the team believes in, by landmarks with names."""
         return self._seen()
 
     def named(self, seen: tuple[Landmarks, ...]) -> tuple[Sensor, ...]:

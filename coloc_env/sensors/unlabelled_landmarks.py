@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import torch
 from jaxtyping import Int64
 from torch import Tensor
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnlabelledLandmarks(Sensor):
-    """Leaves ``unlabelled_landmarks`` [L · d], ``unlabelled_mask`` [L] and ``landmark_map`` [L · d].
+    """Leaves ``unlabelled_landmarks`` [L · d], ``unlabelled_mask`` [L], ``landmark_map`` [L · d].
 
     What ``labelled`` landmarks give (vectors in the body frame, m), in an order that is drawn for
     every UAV and step: entry m is that of any landmark of the map.
