@@ -45,6 +45,15 @@ class Association:
         squared = found.squared.masked_fill(~found.mask.unsqueeze(-1), torch.inf)
         return nearest(squared, chi_square(self.gate, self.process.dim))
 
+    def unseen(self, observation: Observation) -> Observation:
+        """The observation with named landmarks of which none is seen."""
+        points, d = observation["landmark_map"], self.process.dim
+        nothing = {
+            "landmarks": torch.zeros_like(points),
+            "landmark_mask": torch.zeros_like(points[..., ::d]),
+        }
+        return Observation({**observation.leaves, **nothing})
+
     def named(self, prior: Prediction) -> Prediction:
         """The same with ``landmarks`` and ``landmark_mask`` in the order of the map."""
         seen, d = prior.observation, self.process.dim

@@ -73,7 +73,7 @@ class CooperativeEkf(GaussianFilter):
         iterations: PositiveCount = 2,
         cooperate: bool = True,
         second_order: bool = False,
-        association: AssociationName = "nearest",
+        association: AssociationName = "joint",
     ) -> None:
         super().__init__(believed)
         self.iterations, self.second_order = iterations, second_order
@@ -122,6 +122,8 @@ class CooperativeEkf(GaussianFilter):
         return self.screen.exchanges or self.fusion is not None
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
+        if self.association is not None:
+            observation = self.association.unseen(observation)
         return self.screen.memory(observation)
 
     def shared(self, observation: Observation) -> Float[Tensor, "B N H"]:

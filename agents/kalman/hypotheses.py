@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from agents.association import Candidates
+from agents.association.clutter import CLUTTER, log_mixture
 from agents.models.measurements import Block
 from agents.models.process import Process
+from agents.robust.heavy_tails import gaussian_log_density
 from agents.robust.mahalanobis import innovation_terms
 
-CLUTTER = 0.05  # share of measurements that say nothing of the state
 _FAR = 10.0  # m, rad: standard deviation of what they say
 _WORST = -1e9  # of a log-weight: whatever else went wrong, some hypothesis is left
 _LEAST = math.log(1e-8)  # of a weight: what is less likely is given up
@@ -20,28 +21,26 @@ _CLOSE = 0.25  # squared distance per error of the pose below which two hypothes
 
 
 def log_predictive(block: Block, covariance: Float64[Tensor, "B N E E"]) -> Float64[Tensor, "B N"]:
-    """Σ log p(z) of a block's measurements, each (1 − ε) N(ν; 0, S) + ε N(ν; 0, S + 10² I); ties
+    """Σ log p(z) of a block's measurements, each (1 − ε) N(ν; 0, S) + ε N(ν; 0, 10² I); ties
     between measurements through the prior are left out."""
     size = block.residual.shape[-1]
     near = _log_normal(*innovation_terms(block, covariance))
-    wide = (block.residual**2 / _FAR**2).sum(-1) + size * math.log(2 * math.pi * _FAR**2)
-    both = torch.logaddexp(near + math.log1p(-CLUTTER), math.log(CLUTTER) - 0.5 * wide)
+    wide = gaussian_log_density((block.residual**2).sum(-1) / _FAR**2, size)
+    wide = wide - size * math.log(_FAR)
+    both = torch.logaddexp(near + math.log1p(-CLUTTER), wide + math.log(CLUTTER))
     return both.masked_fill(~block.mask, 0.0).sum(-1)
 
 
-def log_mixture(found: Candidates, volume: float) -> Float64[Tensor, "B N"]:
-    """Σ log p(z) of landmark vectors without names, each a mixture over the L landmarks of the map:
-    ε / V + (1 − ε) / L · Σ_l N(z; ẑ_l, S_l), V (m³) being the volume in which clutter lies."""
-    size, count = found.z.shape[-1], found.expected.shape[-2]
-    each = -0.5 * (found.squared + found.log_det.unsqueeze(-2) + size * math.log(2 * math.pi))
-    seen = each.logsumexp(-1) + math.log1p(-CLUTTER) - math.log(count)
-    clutter = torch.full_like(seen, math.log(CLUTTER) - math.log(volume))
-    return torch.logaddexp(seen, clutter).masked_fill(~found.mask, 0.0).sum(-1)
+def log_any_landmark(found: Candidates, volume: float) -> Float64[Tensor, "B N"]:
+    """Σ log p(z) of landmark vectors without names: ε / V + (1 − ε) / L · Σ_l N(z; ẑ_l, S_l)."""
+    each = gaussian_log_density(found.squared, found.z.shape[-1])
+    each = each - 0.5 * found.log_det.unsqueeze(-2)
+    return log_mixture(each, volume).masked_fill(~found.mask, 0.0).sum(-1)
 
 
 def _log_normal(terms: Sequence[Tensor], pivots: Sequence[Tensor]) -> Tensor:
-    each = [t + p.log() + math.log(2 * math.pi) for t, p in zip(terms, pivots, strict=True)]
-    return -0.5 * sum(each[1:], each[0])
+    each = [t + p.log() for t, p in zip(terms, pivots, strict=True)]
+    return gaussian_log_density(sum(each[1:], each[0]), len(each))
 
 
 def reweighed(log_weights: Float64[Tensor, "B N K"]) -> Float64[Tensor, "B N K"]:

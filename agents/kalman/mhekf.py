@@ -13,6 +13,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.association import AssociationName
+from agents.association.clutter import reach_volume
 from agents.kalman import hypotheses
 from agents.kalman.ekf import CooperativeEkf
 from agents.kalman.filter import GaussianBelief
@@ -79,10 +80,7 @@ class MultiHypothesisEkf(Localizer[HypothesesBelief]):
             raise ValueError("robust=cross is not allowed: each hypothesis judges for itself")
         self.process = self.ekf.process
         sensor = believed.sensor(UnlabelledLandmarks)
-        reach = 1.0 if sensor is None else sensor.labelled.radius
-        self.volume = (4 / 3 * math.pi if believed.arena.dim == 3 else math.pi) * (
-            reach**believed.arena.dim
-        )
+        self.volume = 1.0 if sensor is None else reach_volume(sensor, believed.arena.dim)
 
     def reset(self, observation: Observation) -> HypothesesBelief:
         one = self.ekf.reset(observation)
@@ -187,7 +185,7 @@ class MultiHypothesisEkf(Localizer[HypothesesBelief]):
         for model in ekf.models:
             if ekf.association is not None and isinstance(model, LandmarkVectors):
                 found = ekf.association.candidates(prior)
-                total = total + hypotheses.log_mixture(found, self.volume)
+                total = total + hypotheses.log_any_landmark(found, self.volume)
             elif model.testable:
                 block = model.linearize(self.process, prior.state, seen, neighbours)
                 total = total + hypotheses.log_predictive(block, prior.covariance)

@@ -18,12 +18,19 @@ DEGREES = 4.0  # ν of Student's t
 OUTLIERS, SPREAD = 0.1, 10.0  # of the mixture: share of the wide part, its standard deviations
 
 LogDensity = Callable[[Float[Tensor, "*s"], int], Float[Tensor, "*s"]]
+"""log p by s and k, where R = I."""
+
+
+def gaussian_log_density(squared: Float[Tensor, "*s"], size: int) -> Float[Tensor, "*s"]:
+    """log N(0, I) = −(s + k log 2π)/2."""
+    return -0.5 * (squared + size * math.log(2 * math.pi))
 
 
 def student_log_density(squared: Float[Tensor, "*s"], size: int) -> Float[Tensor, "*s"]:
-    """log p of Student's t with ν = 4 and shape R, but for its value at 0:
-    −(ν + k)/2 · log(1 + s/ν)."""
-    return -0.5 * (DEGREES + size) * (squared / DEGREES).log1p()
+    """log p of Student's t with ν = 4 and shape I: −(ν + k)/2 · log(1 + s/ν) + const."""
+    top = math.lgamma(0.5 * (DEGREES + size)) - math.lgamma(0.5 * DEGREES)
+    at_zero = top - 0.5 * size * math.log(DEGREES * math.pi)
+    return at_zero - 0.5 * (DEGREES + size) * (squared / DEGREES).log1p()
 
 
 def student_weights(block: Block) -> Float[Tensor, "B N m"]:
@@ -33,21 +40,22 @@ def student_weights(block: Block) -> Float[Tensor, "B N m"]:
 
 
 def mixture_log_density(squared: Float[Tensor, "*s"], size: int) -> Float[Tensor, "*s"]:
-    """log p of (1 − ε) N(0, R) + ε N(0, c² R), ε = 0.1, c = 10, but for log |2πR|/2."""
-    narrow = math.log1p(-OUTLIERS) - 0.5 * squared
+    """log p of (1 − ε) N(0, I) + ε N(0, c² I), ε = 0.1, c = 10."""
+    narrow = math.log1p(-OUTLIERS) + gaussian_log_density(squared, size)
     return torch.logaddexp(narrow, _wide(squared, size))
 
 
 def mixture_weights(block: Block) -> Float[Tensor, "B N m"]:
     """γ + (1 − γ)/c², γ being the probability of the narrow part given the residual."""
     squared, size = _squared(block), block.residual.shape[-1]
-    narrow = math.log1p(-OUTLIERS) - 0.5 * squared
+    narrow = math.log1p(-OUTLIERS) + gaussian_log_density(squared, size)
     inlier = torch.sigmoid(narrow - _wide(squared, size))
     return inlier + (1 - inlier) / SPREAD**2
 
 
 def _wide(squared: Float[Tensor, "*s"], size: int) -> Float[Tensor, "*s"]:
-    return math.log(OUTLIERS) - size * math.log(SPREAD) - 0.5 * squared / SPREAD**2
+    wide = gaussian_log_density(squared / SPREAD**2, size)
+    return math.log(OUTLIERS) - size * math.log(SPREAD) + wide
 
 
 def _squared(block: Block) -> Float[Tensor, "B N m"]:
