@@ -49,6 +49,7 @@ from coloc_env.sensors import (
     Tdoa,
     UavBearings,
     Ultrasonic,
+    UnlabelledLandmarks,
 )
 from coloc_env.sensors.base import usable
 
@@ -102,10 +103,11 @@ MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     Tdoa: RangeDifferences,
     UavBearings: UavRangeBearings,
     Ultrasonic: WallDistances,
+    UnlabelledLandmarks: LandmarkVectors,
 }
 _BODY_FRAME = (
     *(ArrivalAngles, Compass, Landmarks, LandmarkBearings, Light, Magnetic, OpticalFlow),
-    *(UavBearings, Ultrasonic),
+    *(UavBearings, Ultrasonic, UnlabelledLandmarks),
 )
 
 
