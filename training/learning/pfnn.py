@@ -139,9 +139,7 @@ class Samples:
         where, known = self.late.at(int(before.step.flatten()[0]))
         return where.to(before.last), there & known
 
-    def _contrasted(
-        self, before: Any, after: Any, tensordict: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _contrasted(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The particles before the step moved by the IMU, half of them by what moved a particle of
         the next UAV."""
         d, half = self.dim, self.size // 2
