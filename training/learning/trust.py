@@ -186,8 +186,8 @@ def trust(
     believed, combinations) are run with the newest weights, in turn by the filter alone and by its
     bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through
     the learned filter. ``variants``: overrides of ``scenario``, separated by slashes (none: those
-    above; a recording as it is). The learning rate falls linearly to a twentieth. ``start``: the checkpoint
-    whose weights it starts from (``none``: random ones).
+    above; a recording as it is). The learning rate falls linearly to a twentieth. ``start``: the
+    checkpoint whose weights it starts from, by name or path (``none``: random ones).
 
     ``labels``: the ``truth``; or, without any truth, ``left_out``, the likelihood of each
     measurement predicted by all others and the past in place of the position's, or
