@@ -14,6 +14,7 @@ from torch import Tensor
 from agents import make
 from agents.models.measurements import AnchorRanges
 from agents.policies.adapters import LocalizerPolicy
+from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import AnchorRanging, Landmarks
 from training.learning.episodes import Episode
@@ -62,7 +63,7 @@ def calibrated(scenario: Scenario, worlds: int, seed: int, device: str = "cpu") 
     batch = _episode(scenario, worlds, seed, policy, device)
     d = scenario.arena.dim
     seen = batch["uav", "observation"]
-    ranges, there = AnchorRanges(sensor).read(_Leaves(seen))
+    ranges, there = AnchorRanges(sensor).read(Observation(dict(seen.items())))
     anchors = seen["anchor_map"].double().unflatten(-1, (-1, d))
     start = batch["uav", "action"][..., :d].double()
     offset = torch.arange(-AROUND, AROUND + 1, device=start.device)
@@ -74,16 +75,6 @@ def calibrated(scenario: Scenario, worlds: int, seed: int, device: str = "cpu") 
     lag = offset.double() * scenario.arena.dt
     p, known = trilaterated(start, anchors, z, counted, lag, max(sensor.noise.std, 1e-3))
     return Labels(p, known & batch["uav", "mask"])
-
-
-class _Leaves(dict[str, Tensor]):
-    """An episode's leaves, as a measurement model reads those of a step."""
-
-    def __init__(self, seen: TensorDictBase) -> None:
-        super().__init__(seen.items())
-
-    def once(self, key: object, make: Any) -> Any:
-        return make()
 
 
 def trilaterated(

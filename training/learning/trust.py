@@ -121,6 +121,7 @@ class TrustLoss(LossModule):
             observation = Observation({name: seen[name] for name in all_leaves(scenario)})
             belief, estimate = ekf.step(belief, observation)
             if where is None:
+                assert isinstance(ekf.screen, Watched)
                 loss, count = ekf.screen.surprise(belief.covariance)
             else:
                 offset = estimate.position - where[:, t]
@@ -198,9 +199,9 @@ def trust(
     (none on a recording).
     """
     recorded = isinstance(parse_scenario(scenario).motion, RecordedMotion)
-    chosen = ("",) if recorded else VARIANTS
+    chosen: Sequence[str] = ("",) if recorded else VARIANTS
     if variants is not None:
-        chosen = tuple(variants.split("/"))
+        chosen = variants.split("/")
     scenarios = [parse_scenario(scenario, variant) for variant in chosen]
     require_batches("trust", scenarios, steps)
     network = _first(start, seed).to(device)
