@@ -41,6 +41,7 @@ LOCALIZERS = Registry(
         "ippo": "agents.policies.ippo:Ippo",
         "map": "agents.swarm.map:RecursiveMap",
         "mappo": "agents.policies.mappo:Mappo",
+        "mhekf": "agents.kalman.mhekf:MultiHypothesisEkf",
         "mds": "agents.swarm.mds:MdsMap",
         "nnhpff": "agents.particle.nnhpff:NeuralHpff",
         "pf": "agents.particle.pf:Pf",

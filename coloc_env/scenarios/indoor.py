@@ -17,27 +17,32 @@ from coloc_env.motion import (
 from coloc_env.network import WalledNetworkOptions
 from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds, PositiveSpeed
 from coloc_env.scenario import (
+    AttitudePriorOptions,
     ConstantVelocity,
     Inertial,
-    PriorOptions,
     Process,
     Scenario,
     TeamOptions,
 )
-from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions
+from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, access_points
 from coloc_env.sensors import (
     AngleOptions,
     BarometerOptions,
+    CompassOptions,
     FlowOptions,
     GnssOptions,
     LandmarkOptions,
+    LightOptions,
+    MagneticOptions,
     MapOptions,
     Ranging,
+    RssiOptions,
     Sensor,
     SightOptions,
     SimulatedImuOptions,
     TagOptions,
     UavRangeOptions,
+    UltrasonicOptions,
 )
 
 
@@ -60,13 +65,18 @@ def indoor(
     gnss: GnssOptions = GnssOptions(),
     flow: FlowOptions = FlowOptions(),
     barometer: BarometerOptions = BarometerOptions(),
+    compass: CompassOptions = CompassOptions(),
+    light: LightOptions = LightOptions(),
+    rssi: RssiOptions = RssiOptions(),
+    ultrasonic: UltrasonicOptions = UltrasonicOptions(),
+    magnetic: MagneticOptions = MagneticOptions(),
     imu: SimulatedImuOptions = SimulatedImuOptions(),
     network: WalledNetworkOptions = WalledNetworkOptions(),
     sight: SightOptions = SightOptions(),
     gusts: GustOptions = GustOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
     control: ControlOptions = ControlOptions(),
-    prior: PriorOptions = PriorOptions(),
+    prior: AttitudePriorOptions = AttitudePriorOptions(),
 ) -> Scenario:
     """UAVs in a room, with an IMU, landmarks seen as body-frame vectors, and UWB between all UAVs.
 
@@ -78,6 +88,8 @@ def indoor(
     """
     if anchors.nlos_anchor is not None and not anchors.anchors:
         raise ValueError(f"nlos_anchor={anchors.nlos_anchor} is not allowed: there are no anchors")
+    if landmarks.association == "unknown" and not mapping.landmarks_known:
+        raise ValueError("association=unknown is not allowed with landmarks_known=false")
     arena = Arena(3, team.n_uavs, dt, (0.0, 0.0, 0.0), room)
     radio = network.network(wall_loss=math.inf if sight.wall_delay == math.inf else 0.0)
     inside, path = sight.sight(radio.walls), gusts.of(_around(MOTIONS[motion], radio.walls))
@@ -90,8 +102,9 @@ def indoor(
         true.append(imu.true)
         believed.append(imu.believed)
         process = Inertial(imu.accel_bias, imu.gyro_bias) if imu.estimated else Inertial()
-    true += mapping.of(landmarks.behind(inside))
-    believed += mapping.of(landmarks.believed)
+    seen = landmarks.named if mapping.landmarks_known else mapping.of
+    true += seen(landmarks.behind(inside))
+    believed += seen(landmarks.believed)
     arms = tags.arms(team.n_uavs)
     if uwb:
         true.append(Ranging(ranges.true, arms, ranges.uwb_delay, sight=inside))
@@ -102,8 +115,12 @@ def indoor(
     true += tdoa.true(room, arms)
     believed += tdoa.believed(room, arms)
     others = (*angles.true, *gnss.true(team.n_uavs), *flow.true, *barometer.true)
-    true += others
-    believed += others
+    senses = (
+        *(*compass.true, *light.true(room, radio.walls), *access_points(rssi, room, radio.walls)),
+        *(*ultrasonic.true(room, radio.walls), *magnetic.true(room)),
+    )
+    true += (*others, *senses)
+    believed += (*others, *senses)
     return Scenario(
         name="indoor-v0",
         arena=arena,
@@ -111,7 +128,7 @@ def indoor(
         motion=control.of(kidnap.of(path, dt), v_max, radio.walls),
         sensors=tuple(true),
         network=radio,
-        prior=prior.at_start(),
+        prior=prior.with_attitude(),
         process=process,
         believed_sensors=tuple(believed),
         failure_rate=team.failure_rate,
