@@ -171,7 +171,8 @@ class RaoBlackwellFilter(ParticleFilter):
             each = model.linearize(process, particles, *around, derivatives=False)
             r = each.residual.masked_fill(~each.mask.unsqueeze(-1), 0.0)
             r = r.flatten(-2).to(particles.dtype)
-            squared = squared + (r.square() @ inverse.to(r.dtype).unsqueeze(-1))[..., 0]
-            vector = vector + r @ scaled.to(r.dtype)
+            # As products whose rounding does not depend on how many UAVs there are.
+            squared = squared + (r.square() * inverse.to(r.dtype).unsqueeze(-2)).sum(-1)
+            vector = vector + (scaled.mT.to(r.dtype) @ r.mT).mT
         after = posterior(prior, precision, torch.zeros_like(prior[..., 0]))[1]
         return _Seen(squared, vector, after)
