@@ -131,4 +131,4 @@ def _apart(ours: Floats | None, other: Floats | None) -> str:
     if ours is None or other is None:
         return DASH
     less = gain(ours, other)
-    return signed(Difference(-less.mean, -less.high, -less.low), "")
+    return signed(Difference(*(0.0 - x for x in (less.mean, less.high, less.low))), "")

@@ -1,4 +1,4 @@
-"""Rivals that the field would ask for, beside the paper's: where each is good, and what it costs."""
+"""Rivals that the field would ask for, beside the paper's: where each is good, and its cost."""
 
 from collections.abc import Iterator
 from typing import Any
