@@ -508,6 +508,6 @@ def test_every_regime_is_trained_in_and_builds(tmp_path: Path) -> None:
     for variant, training in zip(every, trained, strict=True):
         learned_in = parse_scenario(dict(training.options)["scenario"])
         assert learned_in.horizon == variant.build().horizon == 300
-        assert learned_in.overrides == variant.build().overrides | {"horizon": 300}
+        assert learned_in.overrides == {**variant.build().overrides, "horizon": 300}
     chosen = Settings(tmp_path, 2, variants=["ranges-random"])
     assert [t.key for t in regimes.trainings(chosen)] == ["ranges-random-300"]

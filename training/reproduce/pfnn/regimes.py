@@ -20,7 +20,7 @@ from training.reproduce.verdicts import gain
 from training.reproduce.work import WORLD, Cell, Training, Variant
 
 STEPS = 300  # of a run, and of a training episode, unless a study is cut shorter
-EPOCHS = 8
+EPOCHS = 5
 UNTRAINED = "pfnn:weights=none"
 PLAIN, KALMAN = "apf", "ekf"
 GEOMETRIES: dict[str, tuple[str, dict[str, Any]]] = {
