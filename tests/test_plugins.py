@@ -80,7 +80,7 @@ def test_a_sensor_is_used_and_bounded(installed: dict[str, str], tmp_path: Path)
         "horizon=100",
         "--no-figures",
     ]
-    done = coloc(installed, "evaluate", "beacon-v0", *words, "--out", str(out))
+    done = coloc(installed, "evaluate", "beacon-room-v0", *words, "--out", str(out))
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "results.json").read_text())
     figures = found["agents"]

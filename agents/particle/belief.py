@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.association import Association
 from agents.models.measurements import Neighbours
 from agents.robust import Trust
 from coloc_env import noise
@@ -46,13 +47,15 @@ class ParticleBelief(TensorClass):
 @dataclass(frozen=True)
 class Step:
     """A step's inputs: the belief before it, what is observed, what neighbours sent, how far each
-    model's measurements are trusted, and the UAVs' random keys for this step."""
+    model's measurements are trusted, the UAVs' random keys for this step, and how landmarks without
+    names get some for a Gaussian update."""
 
     belief: ParticleBelief
     observation: Observation
     neighbours: Neighbours
     trusts: Sequence[Trust]
     key: Int64[Tensor, "B N"]
+    association: Association | None = None
 
 
 def own_keys(observation: Observation, seed: int) -> Int64[Tensor, "B N"]:

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
+from agents.association import AssociationName, associated
+from agents.association.clutter import reach_volume
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
@@ -28,11 +30,13 @@ from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.registry import NotServed
 from agents.robust import RobustScreen, Screen, Trust
+from agents.robust.heavy_tails import mixture_log_density, student_log_density
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
 from coloc_env.options import Count, OpenShare, PositiveMetres, Quantity
 from coloc_env.scenario import Believed
+from coloc_env.sensors import UnlabelledLandmarks
 
 Proposal = Literal["prior", "ekf"]
 Renewal = Literal["ekf", "none"]
@@ -44,6 +48,9 @@ Foreseen = tuple[
 ]  # particles, log-weights, log-likelihoods, whether too few count
 Variant = Literal["regularized", "paper"]
 Particles = Annotated[int, Quantity("", 10, 100_000)]
+Pairing = Literal["mixture", "nearest", "joint"]
+Likelihood = Literal["gaussian", "student", "mixture"]
+_TAILS = {"gaussian": None, "student": student_log_density, "mixture": mixture_log_density}
 _USUAL = ("liu_west", "ekf", "prior", "none")  # perturb, renewal, proposal, robust
 
 
@@ -75,6 +82,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
     N(0, ``perturb_std``²) m added to positions, a tenth of it to velocities (m/s) and attitudes
     (rad), no tempering and no redraw.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
+    ``likelihood`` of each measurement: ``gaussian``, ``student``'s t with ν = 4, or a ``mixture``
+    of two Gaussians. ``association`` of landmarks that come without names: for each particle a
+    ``mixture``, in which a vector may be of any landmark, or clutter; or as ``ekf`` pairs them, at
+    the cloud's moments.
     ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.
     """
@@ -98,6 +109,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         compile: bool = False,
         variant: Variant = "regularized",
         perturb_std: PositiveMetres = PERTURB_STD,
+        likelihood: Likelihood = "gaussian",
+        association: Pairing = "mixture",
     ) -> None:
         super().__init__(believed)
         self.printed = variant == "paper"
@@ -117,6 +130,19 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        self.tails, self.heavy = _TAILS[likelihood], None
+        if likelihood != "gaussian" and robust == "none":
+            self.heavy = RobustScreen(self.process, self.models, likelihood, gate)
+        method: AssociationName = "joint" if association == "mixture" else association
+        self.association = associated(believed, self.process, method, gate)
+        self.volume: float | None = None
+        sensor = believed.sensor(UnlabelledLandmarks)
+        if sensor is not None and association == "mixture":
+            self.volume = reach_volume(sensor, believed.arena.dim)
+            if robust != "none":
+                raise NotServed(
+                    "robust screens judge named landmarks: association=nearest or joint"
+                )
         made = PrintedResampling(self.process, perturb_std, bounds) if self.printed else None
         self.resampling = made or Resampling.of(self.process, perturb, bounds)
         self.compiled = compile
@@ -131,6 +157,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         return self.screen.exchanges
 
     def reset(self, observation: Observation) -> ParticleBelief:
+        if self.association is not None:
+            observation = self.association.unseen(observation)
         prior = observation["prior"]
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
@@ -168,7 +196,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
             neighbours = received(self.believed, observation)
             if self.printed:
                 neighbours = replace(neighbours, variance=torch.zeros_like(neighbours.variance))
-        now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
+        trusts = [Trust()] * len(self.models)
+        now = Step(belief, observation, neighbours, trusts, key, self.association)
         found = self._updated(now)
         weighed = self.resampling.weigh(found.particles, found.log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
@@ -257,12 +286,14 @@ class ParticleFilter(Localizer[ParticleBelief]):
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
         density, renewed = None, torch.zeros_like(belief.renewed)
-        if self.models and (self.screen.judges or self.proposal == "ekf" or self.biases):
+        if self.models and (self._paired or self._judged):
             particles = self.process.propagate(particles, u, dt, draws)
             density = importance_density(
                 self.screen, self.resampling.floor, particles, log_weights, now
             )
             now = replace(now, trusts=density.posterior.trusts)
+            if self._paired:
+                now = replace(now, observation=density.prior.observation)
             if self.proposal == "ekf":
                 particles, log_weights = draw(self.process, density, now, slots)
                 renewed = ~renewed
@@ -287,7 +318,9 @@ class ParticleFilter(Localizer[ParticleBelief]):
     ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
         """What ``Rejuvenation`` makes of evidence that leaves too ``few``."""
         evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
-        rejuvenation = Rejuvenation(evidence, self.screen, self.resampling, now, renews)
+        rejuvenation = Rejuvenation(
+            evidence, self.screen, self.resampling, now, renews, self.heavy or self.screen
+        )
         return rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
 
     def _foresee(
@@ -320,9 +353,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """Log-likelihood of each particle, and its learned correction."""
         centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
         evidence = now.observation, now.neighbours, now.trusts
-        gain = log_likelihood(self.models, self.process, particles, centre, *evidence)
+        gain = log_likelihood(
+            self.models, self.process, particles, centre, *evidence, self.tails, self.volume
+        )
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
+
+    @property
+    def _judged(self) -> bool:
+        """Whether every step needs a Gaussian update beside the particles."""
+        return self.screen.judges or self.proposal == "ekf" or bool(self.biases)
+
+    @property
+    def _paired(self) -> bool:
+        """Whether landmarks without names get some, the same for all particles."""
+        return self.association is not None and self.volume is None
 
     @property
     def biases(self) -> Biases:

@@ -29,7 +29,7 @@ PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("docs/tutori
 FENCE = re.compile(r"^```(?P<kind>\w+)[^\n]*\n(?P<code>.*?)^```", re.MULTILINE | re.DOTALL)
 INCLUDED = re.compile(r'--8<-- "([^":]+)')
 EXAMPLE = {
-    "beacon-v0",
+    "beacon-room-v0",
     "corridor-v0",
     "anchor_mean",
 }  # of tests/example_package: tests/test_plugins.py

@@ -25,9 +25,9 @@ CENTRE = (15.0, 10.0, 2.5)
 @pytest.fixture(autouse=True)
 def beacons() -> Iterator[None]:
     """What the package's entry point does; its module registered the model and the information."""
-    SCENARIOS.register("beacon-v0")(beacon_room)
+    SCENARIOS.register("beacon-room-v0")(beacon_room)
     yield
-    SCENARIOS.remove("beacon-v0")
+    SCENARIOS.remove("beacon-room-v0")
 
 
 def rmse(agent: str, scenario: Scenario) -> float:
@@ -44,7 +44,7 @@ def rmse(agent: str, scenario: Scenario) -> float:
 
 
 def test_the_leaf_is_what_the_sensor_measures() -> None:
-    world = World(make_scenario("beacon-v0", n_uavs=2), WORLDS)
+    world = World(make_scenario("beacon-room-v0", n_uavs=2), WORLDS)
     seen = world.reset(torch.arange(WORLDS))["beacon"]
     apart = torch.tensor(CENTRE, dtype=torch.float64) - world.truth.position
     exact = apart.unsqueeze(-2) @ rotation_matrix(world.truth.attitude)
@@ -53,7 +53,7 @@ def test_the_leaf_is_what_the_sensor_measures() -> None:
 
 
 def test_its_jacobian_is_that_of_finite_differences() -> None:
-    scenario = make_scenario("beacon-v0", n_uavs=2)
+    scenario = make_scenario("beacon-room-v0", n_uavs=2)
     process, model = make_process(scenario.believed), BeaconVectors(Beacon(CENTRE))
     observation = World(scenario, 3).reset(torch.arange(3))
     x = process.initial(observation["prior"].double())[0]
@@ -70,7 +70,7 @@ def test_its_jacobian_is_that_of_finite_differences() -> None:
 
 
 def test_its_information_sharpens_the_bound() -> None:
-    scenario = make_scenario("beacon-v0", n_uavs=2)
+    scenario = make_scenario("beacon-room-v0", n_uavs=2)
     blind = replace(scenario, sensors=scenario.sensors[:1])
     with_beacon, without = (posterior_bound(s, 8, steps=STEPS).rmse for s in (scenario, blind))
     assert 0 < with_beacon < 0.5 * without
@@ -78,7 +78,7 @@ def test_its_information_sharpens_the_bound() -> None:
 
 def test_an_ekf_uses_it() -> None:
     """It beats dead reckoning by far, and no more than the bound allows."""
-    scenario = make_scenario("beacon-v0", n_uavs=2)
+    scenario = make_scenario("beacon-room-v0", n_uavs=2)
     bound = posterior_bound(scenario, WORLDS, steps=STEPS).position[10:].square().mean().sqrt()
     ekf = rmse("ekf", scenario)
     assert ekf < 0.5 * rmse("dead_reckoning", scenario)
@@ -92,7 +92,7 @@ def test_what_extends_a_sensor_has_its_model() -> None:
     class Lamp(Beacon):
         pass
 
-    plain = make_scenario("beacon-v0", n_uavs=2)
+    plain = make_scenario("beacon-room-v0", n_uavs=2)
     lit = (*plain.sensors[:1], Lamp(CENTRE))
     other = replace(plain, sensors=lit, believed_sensors=lit)
     assert rmse("ekf", other) == rmse("ekf", plain)
@@ -112,7 +112,7 @@ def test_a_sensor_between_uavs_counts_for_the_team_alone() -> None:
         def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
             return {"whistle": super().sample(window, placed)["beacon"]}
 
-    plain = make_scenario("beacon-v0", n_uavs=2)
+    plain = make_scenario("beacon-room-v0", n_uavs=2)
     other = replace(plain, sensors=(*plain.sensors, Whistle(CENTRE)))
     alone = posterior_bound(other, 2, steps=5, cooperative=False)
     assert torch.equal(alone.mse, posterior_bound(plain, 2, steps=5, cooperative=False).mse)

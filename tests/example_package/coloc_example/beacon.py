@@ -110,7 +110,7 @@ def beacon_room(
     beacon = Beacon(at=(15.0, 10.0, 2.5), std=beacon_std)
     return replace(
         plain,
-        name="beacon-v0",
+        name="beacon-room-v0",
         sensors=(*plain.sensors, beacon),
         believed_sensors=(*plain.believed_sensors, beacon),
     )
