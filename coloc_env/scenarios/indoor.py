@@ -11,7 +11,7 @@ from coloc_env.scenario import (
     Scenario,
     TeamOptions,
 )
-from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, access_points
+from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, signal_strengths
 from coloc_env.sensors import (
     AngleOptions,
     BarometerOptions,
@@ -87,12 +87,11 @@ def indoor(
     true += tdoa.true(room, arms)
     believed += tdoa.believed(room, arms)
     others = (*angles.true, *gnss.true(team.n_uavs), *flow.true, *barometer.true)
-    senses = (
-        *(*compass.true, *light.true(room, radio.walls), *access_points(rssi, room, radio.walls)),
-        *(*ultrasonic.true(room, radio.walls), *magnetic.true(room)),
-    )
-    true += (*others, *senses)
-    believed += (*others, *senses)
+    around = room, radio.walls
+    senses = (*light.true(*around), *signal_strengths(rssi, *around), *ultrasonic.true(*around))
+    others += (*compass.true, *senses, *magnetic.true(room))
+    true += others
+    believed += others
     return Scenario(
         name="indoor-v0",
         arena=arena,

@@ -19,7 +19,7 @@ from coloc_env.sensors.position_fix import AnchorUavOptions, GnssOptions, Positi
 from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRangeOptions
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
-from coloc_env.sensors.rssi import Rssi, RssiOptions
+from coloc_env.sensors.rssi import PathLoss, Rssi, RssiOptions, UavRssi
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
 from coloc_env.sensors.ultrasonic import Ultrasonic, UltrasonicOptions
@@ -54,6 +54,7 @@ __all__ = [
     "NlosKind",
     "Odometry",
     "OpticalFlow",
+    "PathLoss",
     "PositionFix",
     "RangeNoise",
     "RangeOptions",
@@ -74,6 +75,7 @@ __all__ = [
     "Tdoa",
     "UavBearings",
     "UavRangeOptions",
+    "UavRssi",
     "Ultrasonic",
     "UltrasonicOptions",
     "Window",
