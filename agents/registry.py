@@ -51,6 +51,7 @@ LOCALIZERS = Registry(
         "pfnn": "agents.particle.pfnn:NeuralParticleFilter",
         "pose_graph": "agents.factor_graph.pose_graph:PoseGraph",
         "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
+        "slam": "agents.slam.slam:Slam",
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
         "stgat": "agents.stdcl.stgat:StGat",

@@ -20,9 +20,11 @@ from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRan
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
 from coloc_env.sensors.rssi import PathLoss, Rssi, RssiOptions, UavRssi
+from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
 from coloc_env.sensors.ultrasonic import Ultrasonic, UltrasonicOptions
+from coloc_env.sensors.unmapped import MapOptions, UnmappedLandmarks
 
 __all__ = [
     "GRAVITY",
@@ -51,6 +53,7 @@ __all__ = [
     "LightOptions",
     "Magnetic",
     "MagneticOptions",
+    "MapOptions",
     "NlosKind",
     "Odometry",
     "OpticalFlow",
@@ -69,6 +72,8 @@ __all__ = [
     "Rssi",
     "RssiOptions",
     "Sensor",
+    "Sight",
+    "SightOptions",
     "SimulatedImuOptions",
     "SlowFlight",
     "TagOptions",
@@ -78,5 +83,6 @@ __all__ = [
     "UavRssi",
     "Ultrasonic",
     "UltrasonicOptions",
+    "UnmappedLandmarks",
     "Window",
 ]

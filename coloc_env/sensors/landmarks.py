@@ -1,8 +1,9 @@
 """Landmarks at known positions, seen as relative position vectors in the body frame."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -10,8 +11,11 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotate, rotation_matrix
-from coloc_env.options import Count, Group, Metres, PositiveMetres, Seconds, Share
+from coloc_env.options import Count, Group, Metres, PositiveMetres, Quantity, Seconds, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, usable
+from coloc_env.sensors.sight import Sight
+
+FieldOfView = Annotated[float, Quantity("rad", above=0.0, most=2 * math.pi)]
 
 
 def uniform_points(keys: Int64[Tensor, "R"], stream: str, count: int, layout: Layout) -> Tensor:
@@ -30,6 +34,8 @@ class Landmarks(Sensor):
     ``radius``; landmarks are drawn uniformly in the arena for every world unless ``positions``
     gives them. ``false_matches``: fraction of measurements that belong to another landmark;
     ``dropout``: fraction that is missing; ``off``: times (from, to) in s without any.
+    ``field_of_view``: full opening angle (rad) of the cone about the body's x axis in which they
+    are seen (None: all around; in the plane a sector). ``sight``: what hides them.
     """
 
     count: int = 20
@@ -39,6 +45,8 @@ class Landmarks(Sensor):
     dropout: float = 0.0
     off: tuple[float, float] | None = None
     positions: tuple[tuple[float, ...], ...] | None = None
+    field_of_view: float | None = None
+    sight: Sight = field(default_factory=Sight)
 
     def __post_init__(self) -> None:
         require(
@@ -54,6 +62,8 @@ class Landmarks(Sensor):
             "off",
             "(from, to) in s, from ≤ to",
         )
+        angle = self.field_of_view is None or 0 < self.field_of_view <= 2 * math.pi
+        require(angle, self, "field_of_view", "an opening angle in rad, above 0 and up to 2π")
 
     @property
     def fix_slots(self) -> int:
@@ -102,7 +112,14 @@ class Landmarks(Sensor):
         # Straight to float32: a comparison into a mask of bools takes twice as long.
         reach = torch.full_like(window.alive, -1.0, dtype=torch.float32)
         reach = reach.masked_fill(window.alive, self.radius**2).unsqueeze(-1)
+        rotation = rotation_matrix(motion.attitude.to(torch.float32))
+        if self.field_of_view is not None:
+            reach = torch.where(self._ahead(rotation, apart, squared), reach, -1.0)
         visible = torch.le(squared, reach, out=squared)
+        if not self.sight.clear:
+            ends = motion.position.unsqueeze(-2), placed["positions"][:, None, None]
+            hidden = self.sight.between(window, *ends) > 0
+            visible.masked_fill_(hidden, 0.0)
         if self.false_matches:
             draws = noise.uniform(keys, "landmarks.false", 2 * n * self.count)
             wrong, other = draws.unflatten(-1, (2, n, self.count)).unbind(-3)
@@ -117,7 +134,6 @@ class Landmarks(Sensor):
             time = window.steps * window.layout.arena.dt
             blind = (time >= self.off[0]) & (time < self.off[1])
             visible.masked_fill_(blind[..., None, None], 0.0)
-        rotation = rotation_matrix(motion.attitude.to(torch.float32))
         seen = noise.normal(keys, "landmarks", n * self.count * dim)
         seen = seen.unflatten(-1, (n, self.count, dim)).mul_(self.std)
         for column in range(dim):
@@ -127,13 +143,28 @@ class Landmarks(Sensor):
             seen[..., column].add_(value).mul_(visible)
         return {"landmarks": seen.flatten(-2), "landmark_mask": visible}
 
+    def _ahead(
+        self,
+        rotation: Float32[Tensor, "R K N d d"],
+        apart: list[Float32[Tensor, "R K N L"]],
+        squared: Float32[Tensor, "R K N L"],
+    ) -> Bool[Tensor, "R K N L"]:
+        """Which landmarks lie in the field of view: z₁ ≥ ‖z‖ cos(φ / 2), z = Rᵀ(L − p)."""
+        assert self.field_of_view is not None
+        forward = rotation[..., 0, 0, None] * apart[0]
+        for row in range(1, len(apart)):
+            forward.addcmul_(rotation[..., row, 0, None], apart[row])
+        return forward >= math.cos(0.5 * self.field_of_view) * squared.sqrt()
+
 
 @dataclass(frozen=True)
 class LandmarkOptions(Group):
     """So many ``landmarks`` stand anywhere in the arena; those within ``landmark_radius`` m are
     seen as position vectors with noise of ``landmark_std`` m per axis. A share ``false_matches`` of
     these belongs to another landmark, a share ``landmark_dropout`` is missing, and in the times
-    ``range_only`` (from, to) none is seen. The team believes the Gaussian part alone.
+    ``range_only`` (from, to) none is seen. ``landmark_field``: full opening angle of the cone about
+    the body's x axis in which they are seen (none: all around). The team believes the Gaussian part
+    alone.
     """
 
     title: ClassVar[str] = "landmarks"
@@ -144,11 +175,17 @@ class LandmarkOptions(Group):
     false_matches: Share = 0.0
     landmark_dropout: Share = 0.0
     range_only: tuple[Seconds, Seconds] | None = None
+    landmark_field: FieldOfView | None = None
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
-        """The sensor as it is; nothing without landmarks."""
-        return self._seen(self.false_matches, self.landmark_dropout, self.range_only)
+        """The sensor as it is, with nothing in the way; nothing without landmarks."""
+        seen = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
+        return tuple(replace(one, field_of_view=self.landmark_field) for one in seen)
+
+    def behind(self, sight: Sight) -> tuple[Landmarks, ...]:
+        """The sensor as it is, with what hides landmarks."""
+        return tuple(replace(one, sight=sight) for one in self.true)
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.geometry.walls import depth
+from coloc_env.geometry.walls import crossed
 from coloc_env.motion import Box
 from coloc_env.options import Group, PositiveCount, Quantity, Share
 from coloc_env.sensors.base import (
@@ -59,9 +59,8 @@ class PathLoss:
         apart = own - other
         squared = squared_norm(apart).clamp_min(_NEAR)
         strength = self.power - 0.5 * self.slope * squared.log()
-        for wall in self.walls:
-            behind = depth(own, other, (wall,)) > 0
-            strength = strength - self.wall_loss * behind
+        if self.walls:
+            strength = strength - self.wall_loss * crossed(own, other, self.walls)
         return strength, -self.slope * apart / squared.unsqueeze(-1)
 
     def received(

@@ -26,6 +26,10 @@ RANGES: dict[str, Any] = {
     "uwb_dropout": 0.5,
     "range_bias_std": 0.5,
     "range_bias_time": 3.0,
+    "uwb_outage": 0.5,
+    "uwb_outage_time": 0.2,
+    "uwb_outage_of": "team",
+    "uwb_off": (0.0, 0.2),
 }
 DELAYED = {**RANGES, "uwb_delay": 1}
 LANDMARKS: dict[str, Any] = {
@@ -35,6 +39,7 @@ LANDMARKS: dict[str, Any] = {
     "false_matches": 0.5,
     "landmark_dropout": 0.5,
     "range_only": (0.0, 1.0),
+    "landmark_field": 1.0,
 }
 INS: dict[str, Any] = {"ins_std": 1.0, "ins_bias": 1.0, "ins_bias_time": 5.0}
 PRIOR: dict[str, Any] = {"prior": "uniform", "prior_std": 9.0, "max_speed": 2.0}
@@ -119,6 +124,7 @@ CARRIED: dict[str, Any] = {
     "magnetic_dropout": 0.5,
 }
 IN_THE_WAY = (11.0, 9.0, 0.0, 11.5, 11.0, 5.0)
+PILLAR = (14.0, 9.0, 0.0, 16.0, 11.0, 5.0)
 STEIN: dict[str, Any] = {
     "horizon": 17,
     "dt": 0.2,
@@ -149,7 +155,15 @@ CHANGED: dict[str, dict[str, Any]] = {
         "gyro_bias": 0.9,
         "believed_imu_bias": True,
         "max_neighbours": 2,
-        "walls": (14.0, 9.0, 0.0, 16.0, 11.0, 5.0),
+        "landmarks_known": False,
+        "walls": PILLAR,
+        "wall_delay": 2.0,
+        "wall_std": 0.9,
+        "obstacles": 9,
+        "obstacle_radius": 2.0,
+        "obstacle_speed": 3.0,
+        "gust_std": 0.5,
+        "gust_time": 3.0,
         **CARRIED,
         **TEAM,
         **LANDMARKS,
@@ -222,6 +236,8 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
+    "uwb_outage_time": {"uwb_outage": 0.5},
+    "uwb_outage_of": {"uwb_outage": 0.5},
 }
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
 STEERED: dict[str, dict[str, Any]] = {
@@ -239,6 +255,11 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **UNIFORM,
         **STEERED,
         "v_max": {"control": "velocity"},
+        "wall_delay": {"walls": PILLAR},
+        "wall_std": {"walls": PILLAR},
+        "obstacle_radius": {"obstacles": 9},
+        "obstacle_speed": {"obstacles": 9},
+        "gust_time": {"gust_std": 0.5},
         "nlos_anchor": {"anchors": 2},
         "kidnapped": {"kidnap_at": 0.2},
         "accel_bias": {"imu_bias": True},

@@ -23,6 +23,7 @@ from coloc_env.sensors import (
     PathLoss,
     Rssi,
     Sensor,
+    Sight,
     UavRssi,
     Ultrasonic,
 )
@@ -36,7 +37,7 @@ LAMPS = lamp_places(6, ROOM[1])
 POINTS = ((0.0, 0.0, 0.0), (30.0, 20.0, 5.0), (30.0, 0.0, 0.0))
 EVERY: list[Sensor] = [
     Compass(0.1, dropout=0.3),
-    Light(LAMPS, walls=WALLS),
+    Light(LAMPS, sight=Sight(WALLS, 3)),
     Rssi(POINTS, PathLoss(walls=WALLS), dropout=0.2),
     UavRssi(PathLoss(walls=WALLS), dropout=0.2),
     Ultrasonic(ROOM, walls=WALLS),
@@ -69,7 +70,7 @@ def test_a_compass_shows_the_heading() -> None:
 
 def test_lamps_are_dimmer_farther_away_and_seen_from_below() -> None:
     """By the formula, in numpy, where no wall is between."""
-    sensor = Light(LAMPS, walls=WALLS, radius=9.0)
+    sensor = Light(LAMPS, sight=Sight(WALLS), radius=9.0)
     errors, hidden = [], 0
     lamps = torch.tensor(LAMPS, dtype=torch.float64)
     for seen, truth in seen_by(sensor, 20, 10):
@@ -247,7 +248,8 @@ def test_walls_of_the_network_are_what_senses_meet() -> None:
     wall = (11.0, 5.0, 0.0, 11.5, 12.0, 5.0)
     scenario = make_scenario("indoor-v0", walls=wall, light=True, rssi=True, ultrasonic=True)
     for sensor in scenario.sensors[-3:]:
-        walls = sensor.loss.walls if isinstance(sensor, Rssi) else sensor.walls
+        found = {Rssi: "loss", Light: "sight"}.get(type(sensor))
+        walls = (getattr(sensor, found) if found else sensor).walls
         assert walls == (((11.0, 5.0, 0.0), (11.5, 12.0, 5.0)),)
 
 
