@@ -14,7 +14,7 @@ from agents.models.process import Process, drives, make_process
 from agents.parts import move
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Sensor
+from coloc_env.sensors import Sensor, UnlabelledLandmarks
 
 _HUGE = 1e30  # m; what lies beyond counts as infinite
 
@@ -59,6 +59,8 @@ class Localizer(ABC, Generic[Belief]):
 
     name: ClassVar[str]
     centralized: ClassVar[bool] = False
+    associates: ClassVar[bool] = False
+    """Whether it finds out which landmark is seen where measurements do not say."""
     serves: ClassVar[tuple[type[Sensor], ...] | None] = None
     """Sensors that it makes use of, beside what drives the motion model; None: every sensor that
     has a measurement model."""
@@ -90,8 +92,15 @@ class Localizer(ABC, Generic[Belief]):
         return [
             type(sensor).__name__
             for sensor in believed.sensors
-            if sensor.informs and not drives(believed, sensor) and not isinstance(sensor, served)
+            if sensor.informs
+            and not drives(believed, sensor)
+            and not (isinstance(sensor, served) and cls._names(sensor))
         ]
+
+    @classmethod
+    def _names(cls, sensor: Sensor) -> bool:
+        """Whether it knows, or finds out, what a sensor saw."""
+        return cls.associates or not isinstance(sensor, UnlabelledLandmarks)
 
     @property
     def exchanges(self) -> bool:

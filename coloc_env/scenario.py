@@ -1,14 +1,14 @@
 """Scenarios: what is true, and what the team believes, as separate frozen fields."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from coloc_env.motion import Arena, Motion
 from coloc_env.network import Links, Network
-from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Share
+from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Radians, Share
 from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor, Sight
 from coloc_env.sensors.base import Layout, require
@@ -25,7 +25,9 @@ class Prior:
     Gaussian about the truth with these standard deviations (m, m/s, rad), one draw per UAV and
     world; with ``kind="uniform"`` nothing of the position but that it lies in the arena, and with
     ``max_speed`` (m/s) nothing of the velocity but that each component lies within ± that.
-    ``target_std``: of the positions of targets, in m (None: as of UAVs).
+    ``target_std``: of the positions of targets, in m (None: as of UAVs). ``yaw="uniform"``: nothing
+    is known of the heading, and the mean attitude's is 0 (``attitude_std`` is that of roll and
+    pitch).
     """
 
     position_std: float = 2.0
@@ -34,10 +36,12 @@ class Prior:
     kind: PriorKind = "gaussian"
     max_speed: float | None = None
     target_std: float | None = None
+    yaw: PriorKind = "gaussian"
 
     def __post_init__(self) -> None:
         kinds = get_args(PriorKind)
-        require(self.kind in kinds, self, "kind", f"one of {', '.join(kinds)}")
+        for name in ("kind", "yaw"):
+            require(getattr(self, name) in kinds, self, name, f"one of {', '.join(kinds)}")
         for name in ("position_std", "velocity_std", "attitude_std"):
             require(getattr(self, name) >= 0, self, name, "a standard deviation ≥ 0")
         bounded = self.max_speed is None or (self.kind == "uniform" and 0 < self.max_speed < inf)
@@ -66,6 +70,22 @@ class PriorOptions(Group):
         """The prior; standard deviations in m/s and rad of what the options do not say."""
         speed = self.max_speed if self.prior == "uniform" else None
         return Prior(self.prior_std, velocity_std, attitude_std, self.prior, speed)
+
+
+@dataclass(frozen=True)
+class AttitudePriorOptions(PriorOptions):
+    """Its attitude is known give or take ``prior_attitude_std`` rad per axis; with
+    ``prior_yaw=uniform`` that is of roll and pitch, and its heading may be any.
+    """
+
+    title: ClassVar[str] = "prior"
+
+    prior_attitude_std: Radians = 0.05
+    prior_yaw: PriorKind = "gaussian"
+
+    def with_attitude(self) -> Prior:
+        """The prior, with what the options say of the attitude."""
+        return replace(self.at_start(attitude_std=self.prior_attitude_std), yaw=self.prior_yaw)
 
 
 @dataclass(frozen=True)

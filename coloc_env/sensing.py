@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.channel import Channel
-from coloc_env.geometry import rotate_by
+from coloc_env.geometry import level, rotate_by
 from coloc_env.motion import Carry, Kinematics
 from coloc_env.observation import action_width
 from coloc_env.scenario import Prior, Scenario
@@ -256,6 +256,8 @@ def draw_prior(
     if prior.max_speed is not None:
         velocity = torch.zeros_like(velocity)
     attitude = rotate_by(truth.attitude, prior.attitude_std * draws[..., 2 * dim :])
+    if prior.yaw == "uniform":
+        attitude = level(attitude)
     rest = position.new_tensor((prior.velocity_spread, prior.attitude_std)).expand(
         *position.shape[:2], 2
     )

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from agents.association import AssociationName, associated
 from agents.kalman.exchange import ExchangingEkf
 from agents.kalman.filter import Beside, GaussianBelief, GaussianFilter
 from agents.kalman.fusion import Fusion
@@ -24,23 +25,31 @@ from agents.models.biases import kept_share, reported
 from agents.models.measurements import Neighbours, make_measurements, received
 from agents.models.ordered_update import by_kind, pick
 from agents.models.update import Update, expanded_update, iterated_update
+from agents.registry import NotServed
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
+from coloc_env.sensors import UnlabelledLandmarks
 
-_OTHERS = {"fusion", "second_order"}  # options that the exchange of measurements has not
+_OTHERS = {
+    "fusion",
+    "second_order",
+    "association",
+}  # options that the exchange of measurements has not
 FusionName = Literal["naive", "ci", "pairwise", "exchange"]
 
 
 class CooperativeEkf(GaussianFilter):
     """Cooperative error-state EKF, one per UAV, fed by neighbours' messages.
 
-    ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration;
-    ``gate`` drops innovations outside the χ² quantile ``gate``, ``ransac`` landmarks that do not
-    agree with most others, ``temporal`` what does not agree with the last two steps, ``cross`` what
-    neighbours' measurements contradict. ``iterations`` of each update. ``cooperate=false`` leaves
-    other UAVs out.
+    ``robust``: ``none``, or any of these joined by ``+``: ``huber`` reweights at every iteration
+    (or ``student``, t with ν = 4, or ``mixture``, of two Gaussians); ``gate`` drops innovations
+    outside the χ² quantile ``gate``, ``ransac`` landmarks that do not agree with most others,
+    ``temporal`` what does not agree with the last two steps, ``cross`` what neighbours'
+    measurements contradict. ``iterations`` of each update. ``cooperate=false`` leaves other UAVs
+    out. ``association`` of landmarks that come without names: each with its ``nearest``
+    neighbour, or all with those that are ``joint``ly compatible, within the χ² quantile ``gate``.
 
     ``fusion`` of what involves neighbours: ``naive``, as if their errors were independent; ``ci``,
     covariance intersection, one neighbour after the other; ``pairwise``, UAVs that meet (at most
@@ -51,6 +60,7 @@ class CooperativeEkf(GaussianFilter):
     """
 
     name = "ekf"
+    associates = True
 
     def __init__(
         self,
@@ -63,11 +73,13 @@ class CooperativeEkf(GaussianFilter):
         iterations: PositiveCount = 2,
         cooperate: bool = True,
         second_order: bool = False,
+        association: AssociationName = "joint",
     ) -> None:
         super().__init__(believed)
         self.iterations, self.second_order = iterations, second_order
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        self.association = associated(believed, self.process, association, gate)
         own, shared = by_kind(self.models)
         self.kinds = own, shared
         self.fusion: Fusion | None = None
@@ -87,6 +99,8 @@ class CooperativeEkf(GaussianFilter):
         cls.require_sense(options)
         fusion = options.get("fusion", "naive")
         if fusion == "exchange":
+            if believed.sensor(UnlabelledLandmarks) is not None:
+                raise NotServed("fusion=exchange needs landmarks with names")
             chosen = {name: options[name] for name in options.keys() - _OTHERS}
             return ExchangingEkf(believed, **chosen)
         one = cls(believed, **options)
@@ -108,6 +122,8 @@ class CooperativeEkf(GaussianFilter):
         return self.screen.exchanges or self.fusion is not None
 
     def memory(self, observation: Observation) -> Float[Tensor, "B N K"]:
+        if self.association is not None:
+            observation = self.association.unseen(observation)
         return self.screen.memory(observation)
 
     def shared(self, observation: Observation) -> Float[Tensor, "B N H"]:
@@ -133,6 +149,8 @@ class CooperativeEkf(GaussianFilter):
     ) -> tuple[Float[Tensor, "B N S"], Float[Tensor, "B N E E"], Float[Tensor, "B N K"], Beside]:
         if not self.models:
             return super().update(prior, beside)
+        if self.association is not None:
+            prior = self.association.named(prior)
         if self.fusion is not None:
             return self._fused(prior, beside, self.fusion)
         neighbours, seen = received(self.believed, prior.observation), prior.observation

@@ -110,11 +110,19 @@ class GaussianFilter(Localizer[GaussianBelief]):
     def step(
         self, belief: GaussianBelief, observation: Observation
     ) -> tuple[GaussianBelief, Estimate]:
-        observation = observation.kept()
+        return self.corrected(*self.predicted(belief, observation.kept()))
+
+    def predicted(
+        self, belief: GaussianBelief, observation: Observation
+    ) -> tuple[Prediction, Beside]:
+        """What the observation's measurements will be used on."""
         x, covariance, f = self.predict(belief, observation)
-        prior = Prediction(x, covariance, observation, belief.memory)
         considered = self.biases.predict(belief.considered, f, observation)
         beside = Beside(considered, self.moved(belief.shared, f), belief.step)
+        return Prediction(x, covariance, observation, belief.memory), beside
+
+    def corrected(self, prior: Prediction, beside: Beside) -> tuple[GaussianBelief, Estimate]:
+        """The belief after its measurements were used."""
         x, covariance, memory, beside = self.update(prior, beside)
         after = build(
             GaussianBelief,
@@ -123,7 +131,7 @@ class GaussianFilter(Localizer[GaussianBelief]):
             covariance=covariance,
             considered=beside.considered,
             shared=beside.shared,
-            step=belief.step + 1,
+            step=beside.step + 1,
             memory=memory,
         )
         honest = reported(covariance, beside.considered)

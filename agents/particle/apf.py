@@ -17,6 +17,7 @@ class AdaptiveParticleFilter(ParticleFilter):
     """
 
     name = "apf"
+    associates = True
 
     def __init__(
         self,

@@ -31,13 +31,14 @@ def degenerate(
 @dataclass(frozen=True)
 class Rejuvenation:
     """What is done for UAVs whose weights degenerate in a step; ``renews``: whether they may be
-    redrawn from an EKF's posterior."""
+    redrawn from an EKF's posterior, its measurements judged by ``redrawn_by``."""
 
     evidence: Evidence
     screen: Screen
     resampling: Resampling
     now: Step
     renews: bool
+    redrawn_by: Screen
 
     def rejuvenate(
         self,
@@ -57,7 +58,7 @@ class Rejuvenation:
         if bool(late.any()):
             floor = self.resampling.floor
             density = density or importance_density(
-                self.screen, floor, particles, log_weights, self.now
+                self.redrawn_by, floor, particles, log_weights, self.now
             )
             particles, log_weights, gain = self.redraw(particles, log_weights, gain, late, density)
         if bool(early.any()):

@@ -5,14 +5,16 @@ Neighbours enter as ranges whose variance is inflated by the sender's own uncert
 live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper, Algorithms 1, 2).
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
+from agents.association import AssociationName, associated
+from agents.association.clutter import reach_volume
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
@@ -26,18 +28,43 @@ from agents.particle.likelihood import log_likelihood
 from agents.particle.printed import PERTURB_STD, PrintedResampling, anywhere
 from agents.particle.proposal import ImportanceDensity, draw, importance_density
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
+from agents.registry import NotServed
 from agents.robust import RobustScreen, Screen, Trust
+from agents.robust.heavy_tails import mixture_log_density, student_log_density
 from agents.tensorclasses import build
 from coloc_env import noise
 from coloc_env.observation import Observation
 from coloc_env.options import Count, OpenShare, PositiveMetres, Quantity
 from coloc_env.scenario import Believed
+from coloc_env.sensors import UnlabelledLandmarks
 
 Proposal = Literal["prior", "ekf"]
 Renewal = Literal["ekf", "none"]
+Foreseen = tuple[
+    Float32[Tensor, "B N M S"],
+    Float32[Tensor, "B N M"],
+    Float32[Tensor, "B N M"],
+    Bool[Tensor, "B N"],
+]  # particles, log-weights, log-likelihoods, whether too few count
 Variant = Literal["regularized", "paper"]
 Particles = Annotated[int, Quantity("", 10, 100_000)]
+Pairing = Literal["mixture", "nearest", "joint"]
+Likelihood = Literal["gaussian", "student", "mixture"]
+_TAILS = {"gaussian": None, "student": student_log_density, "mixture": mixture_log_density}
 _USUAL = ("liu_west", "ekf", "prior", "none")  # perturb, renewal, proposal, robust
+
+
+@dataclass(frozen=True)
+class Updated:
+    """A cloud after a step's measurements: particles, log-weights (not normalized), which UAVs'
+    were redrawn from an EKF's posterior, the Gaussian update beside it where anything asks for one,
+    and the covariance of what particles hold only the mean of."""
+
+    particles: Float32[Tensor, "B N M S"]
+    log_weights: Float32[Tensor, "B N M"]
+    renewed: Bool[Tensor, "B N"]
+    density: ImportanceDensity | None
+    conditional: Float64[Tensor, "B N L L"]
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -55,6 +82,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
     N(0, ``perturb_std``²) m added to positions, a tenth of it to velocities (m/s) and attitudes
     (rad), no tempering and no redraw.
     ``robust``, ``gate``: as ``ekf`` has them, decided by a Gaussian update at the cloud's moments.
+    ``likelihood`` of each measurement: ``gaussian``, ``student``'s t with ν = 4, or a ``mixture``
+    of two Gaussians. ``association`` of landmarks that come without names: for each particle a
+    ``mixture``, in which a vector may be of any landmark, or clutter; or as ``ekf`` pairs them, at
+    the cloud's moments.
     ``compile=true`` compiles the step's large parts at the first step (it takes up to a minute
     and needs a C++ compiler); the numbers then differ in their last digits.
     """
@@ -78,6 +109,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         compile: bool = False,
         variant: Variant = "regularized",
         perturb_std: PositiveMetres = PERTURB_STD,
+        likelihood: Likelihood = "gaussian",
+        association: Pairing = "mixture",
     ) -> None:
         super().__init__(believed)
         self.printed = variant == "paper"
@@ -97,6 +130,19 @@ class ParticleFilter(Localizer[ParticleBelief]):
         self.process = make_process(believed)
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         self.screen: Screen = RobustScreen(self.process, self.models, robust, gate)
+        self.tails, self.heavy = _TAILS[likelihood], None
+        if likelihood != "gaussian" and robust == "none":
+            self.heavy = RobustScreen(self.process, self.models, likelihood, gate)
+        method: AssociationName = "joint" if association == "mixture" else association
+        self.association = associated(believed, self.process, method, gate)
+        self.volume: float | None = None
+        sensor = believed.sensor(UnlabelledLandmarks)
+        if sensor is not None and association == "mixture":
+            self.volume = reach_volume(sensor, believed.arena.dim)
+            if robust != "none":
+                raise NotServed(
+                    "robust screens judge named landmarks: association=nearest or joint"
+                )
         made = PrintedResampling(self.process, perturb_std, bounds) if self.printed else None
         self.resampling = made or Resampling.of(self.process, perturb, bounds)
         self.compiled = compile
@@ -111,6 +157,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
         return self.screen.exchanges
 
     def reset(self, observation: Observation) -> ParticleBelief:
+        if self.association is not None:
+            observation = self.association.unseen(observation)
         prior = observation["prior"]
         mean, covariance = self.process.initial(prior)
         key = own_keys(observation, self.seed)
@@ -132,6 +180,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             last=mean[..., : 2 * self.process.dim],
             considered=self.biases.initial(observation, covariance.double()),
             memory=self.screen.memory(observation),
+            conditional=covariance.new_zeros(*key.shape, 0, 0, dtype=torch.float64),
             batch_size=key.shape,
         )
 
@@ -147,11 +196,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
             neighbours = received(self.believed, observation)
             if self.printed:
                 neighbours = replace(neighbours, variance=torch.zeros_like(neighbours.variance))
-        now = Step(belief, observation, neighbours, [Trust()] * len(self.models), key)
-        particles, log_weights, renewed, density = self._updated(now)
-        weighed = self.resampling.weigh(particles, log_weights, belief.count)
+        trusts = [Trust()] * len(self.models)
+        now = Step(belief, observation, neighbours, trusts, key, self.association)
+        found = self._updated(now)
+        weighed = self.resampling.weigh(found.particles, found.log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
-            particles, weighed, belief.count, key
+            found.particles, weighed, belief.count, key
         )
         cloud = self.resampling.estimated(weighed, particles, log_weights)
         mean = cloud.mean
@@ -164,10 +214,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
             key=belief.key,
             step=belief.step + 1,
             ess_share=weighed.ess / belief.count,
-            renewed=renewed,
+            renewed=found.renewed,
             last=mean[..., : 2 * self.process.dim],
-            considered=self._considered(now, density),
-            memory=belief.memory if density is None else density.posterior.memory,
+            considered=self._considered(now, found.density),
+            memory=belief.memory if found.density is None else found.density.posterior.memory,
+            conditional=found.conditional,
         )
         return after, self._estimate(cloud, after.considered)
 
@@ -226,17 +277,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
             return self.capacity
         return min(self.capacity, int(count.max()) + particle_count.GROW)
 
-    def _updated(
-        self, now: Step
-    ) -> tuple[
-        Float32[Tensor, "B N M S"],
-        Float32[Tensor, "B N M"],
-        Bool[Tensor, "B N"],
-        ImportanceDensity | None,
-    ]:
-        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
-        normalized), which were redrawn from an EKF's posterior, and the Gaussian update beside it,
-        where anything asks for one."""
+    def _updated(self, now: Step) -> Updated:
+        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x)."""
         belief = now.belief
         slots = self._slots(belief.count)
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
@@ -244,25 +286,42 @@ class ParticleFilter(Localizer[ParticleBelief]):
         u = self.process.inputs(now.observation).to(torch.float32).unsqueeze(-2)
         dt = elapsed(self.process, belief.step).to(torch.float32).unsqueeze(-1)
         density, renewed = None, torch.zeros_like(belief.renewed)
-        if self.models and (self.screen.judges or self.proposal == "ekf" or self.biases):
+        if self.models and (self._paired or self._judged):
             particles = self.process.propagate(particles, u, dt, draws)
             density = importance_density(
                 self.screen, self.resampling.floor, particles, log_weights, now
             )
             now = replace(now, trusts=density.posterior.trusts)
+            if self._paired:
+                now = replace(now, observation=density.prior.observation)
             if self.proposal == "ekf":
                 particles, log_weights = draw(self.process, density, now, slots)
                 renewed = ~renewed
             gain = self._evidence(particles, log_weights, now)
             few = self._degenerate(log_weights + gain, now)
         else:
-            particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
+            foreseen = self._foresee(particles, log_weights, u, dt, draws, now)
+            particles, log_weights, gain, few = foreseen
         if not (self.models and bool(few.any())):
-            return particles, log_weights + gain, renewed, density
+            return Updated(particles, log_weights + gain, renewed, density, belief.conditional)
+        found = self._rejuvenated(particles, log_weights, gain, few, now, density)
+        return Updated(found[0], found[1], renewed | found[2], density, belief.conditional)
+
+    def _rejuvenated(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        gain: Float32[Tensor, "B N M"],
+        few: Bool[Tensor, "B N"],
+        now: Step,
+        density: ImportanceDensity | None = None,
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
+        """What ``Rejuvenation`` makes of evidence that leaves too ``few``."""
         evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
-        rejuvenation = Rejuvenation(evidence, self.screen, self.resampling, now, renews)
-        found = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
-        return found[0], found[1], renewed | found[2], density
+        rejuvenation = Rejuvenation(
+            evidence, self.screen, self.resampling, now, renews, self.heavy or self.screen
+        )
+        return rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
 
     def _foresee(
         self,
@@ -272,12 +331,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
         dt: Float32[Tensor, "B N 1"],
         draws: Float32[Tensor, "B N M W"],
         now: Step,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
-        """Each particle propagated with its own draw of process noise, its log-likelihood, and
-        whether that leaves too few."""
+    ) -> Foreseen:
+        """Each particle propagated with its own draw of process noise, its log-weight before the
+        evidence, its log-likelihood, and whether that leaves too few."""
         particles = self.process.propagate(particles, u, dt, draws)
         gain = self._evidence(particles, log_weights, now)
-        return particles, gain, self._degenerate(log_weights + gain, now)
+        return particles, log_weights, gain, self._degenerate(log_weights + gain, now)
 
     def _degenerate(self, log_weights: Float32[Tensor, "B N M"], now: Step) -> Bool[Tensor, "B N"]:
         """Whose weights are those of too few particles, which tempering would mend."""
@@ -294,9 +353,21 @@ class ParticleFilter(Localizer[ParticleBelief]):
         """Log-likelihood of each particle, and its learned correction."""
         centre = select(particles, log_weights.argmax(-1, keepdim=True))[..., 0, :]
         evidence = now.observation, now.neighbours, now.trusts
-        gain = log_likelihood(self.models, self.process, particles, centre, *evidence)
+        gain = log_likelihood(
+            self.models, self.process, particles, centre, *evidence, self.tails, self.volume
+        )
         correction = self.log_correction(particles, now.belief)
         return gain if correction is None else gain + correction
+
+    @property
+    def _judged(self) -> bool:
+        """Whether every step needs a Gaussian update beside the particles."""
+        return self.screen.judges or self.proposal == "ekf" or bool(self.biases)
+
+    @property
+    def _paired(self) -> bool:
+        """Whether landmarks without names get some, the same for all particles."""
+        return self.association is not None and self.volume is None
 
     @property
     def biases(self) -> Biases:
@@ -331,4 +402,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
             position=cloud.mean[..., :d],
             velocity=cloud.mean[..., d : 2 * d],
             covariance=covariance[..., :d, :d] + least,
+        )
+
+
+def refuse_biases(localizer: ParticleFilter) -> None:
+    """Raise NotServed where sensors are believed to be biased, which a filter would ignore."""
+    if localizer.biases:
+        raise NotServed(
+            "the biases that sensors are believed to have would be ignored: pf500 considers them"
         )

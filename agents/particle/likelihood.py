@@ -16,7 +16,12 @@ from agents.models.measurements import (
     per_state,
 )
 from agents.models.process import Process
+from agents.particle.landmark_densities import (
+    any_landmark_log_likelihood,
+    each_landmark_log_likelihood,
+)
 from agents.robust import Trust
+from agents.robust.heavy_tails import LogDensity
 from coloc_env.observation import Observation
 
 
@@ -68,8 +73,10 @@ def range_log_likelihood(
     particles: Float32[Tensor, "B N M d"],
     points: Float32[Tensor, "B N S d"],
     trust: Trust,
+    tails: LogDensity | None = None,
 ) -> Float32[Tensor, "B N M"]:
-    """−Σ w (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre."""
+    """−Σ w (r − ‖p − point‖)² / 2s² with the variances s² of the ``block`` made at the centre;
+    ``tails``: another density than the Gaussian."""
     squared: Tensor | None = None
     for own, theirs in zip(particles.unbind(-1), points.unbind(-1), strict=True):
         apart = own.unsqueeze(-2) - theirs.unsqueeze(-1)  # [B, N, S, M]
@@ -78,6 +85,10 @@ def range_log_likelihood(
     if trust.shift is not None:
         ranges = ranges - trust.shift.to(ranges.dtype)
     residual = squared.sqrt_().sub_(ranges.unsqueeze(-1))
+    if tails is not None:
+        each = tails(residual.square_() / block.total_variance.to(ranges.dtype), 1)
+        counted = block.mask if trust.weight is None else block.mask * trust.weight
+        return (each * counted.unsqueeze(-1)).sum(-2)
     weight = trust.information(block)[..., 0].to(ranges.dtype)
     return (weight.unsqueeze(-2) @ residual.square_())[..., 0, :] * -0.5
 
@@ -90,15 +101,28 @@ def log_likelihood(
     observation: Observation,
     neighbours: Neighbours,
     trusts: Sequence[Trust],
+    tails: LogDensity | None = None,
+    volume: float | None = None,
 ) -> Float32[Tensor, "B N M"]:
     """Sum over all sensors' measurements, each weighted by ``trusts``; what a neighbour's
-    uncertainty adds to a range's variance is taken at the centre."""
+    uncertainty adds to a range's variance is taken at the centre. ``tails``: another density than
+    the Gaussian. With a ``volume`` (m³) in which clutter lies, landmarks come without names."""
     total = torch.zeros_like(particles[..., 0])
     d = process.dim
     near = Neighbours(
         neighbours.position.to(total.dtype), neighbours.variance.to(total.dtype), neighbours.known
     )
     for model, trust in zip(models, trusts, strict=True):
+        if isinstance(model, LandmarkVectors) and volume is not None:
+            total = total + any_landmark_log_likelihood(
+                model, process, particles, centre, observation, volume, tails
+            )
+            continue
+        if isinstance(model, LandmarkVectors) and tails is not None:
+            total = total + each_landmark_log_likelihood(
+                model, process, particles, observation, trust.weight, tails
+            )
+            continue
         if isinstance(model, LandmarkVectors):
             total = total + landmark_log_likelihood(
                 model, process, particles, centre, observation, trust
@@ -107,13 +131,21 @@ def log_likelihood(
         if isinstance(model, UavRanges | AnchorRanges) and not model.tags:
             block = model.linearize(process, centre, observation, near, derivatives=False)
             ranges, points = model.ends(observation, near)
-            total = total + range_log_likelihood(block, ranges, particles[..., :d], points, trust)
+            at = particles[..., :d]
+            total = total + range_log_likelihood(block, ranges, at, points, trust, tails)
             continue
         around = per_state(observation, near)
         block = model.linearize(process, particles, *around, derivatives=False)
         trust = _per_particle(trust, total.dtype)
         variance = block.total_variance
         squared = trust.residual(block) ** 2 / variance
+        if tails is not None:
+            each = tails(squared.sum(-1), squared.shape[-1])
+            if block.partner_variance is not None or block.varies:
+                each = each - 0.5 * variance.log().sum(-1)
+            each = each if trust.weight is None else each * trust.weight
+            total = total + each.masked_fill(~block.mask, 0.0).sum(-1)
+            continue
         if block.partner_variance is not None or block.varies:
             squared = squared + variance.log()
         if trust.weight is not None:

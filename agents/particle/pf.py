@@ -13,6 +13,7 @@ class Pf(ParticleFilter):
     """SIR particle filter with 5000 particles per UAV and no tempering (NN-HPFF paper)."""
 
     name = "pf"
+    associates = True
 
     def __init__(
         self,
@@ -31,6 +32,7 @@ class Pf500(ParticleFilter):
     importance weights (``tempering=false``: neither, plain SIR)."""
 
     name = "pf500"
+    associates = True
 
     def __init__(self, believed: Believed, *, particles: Particles = 500, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)
@@ -41,6 +43,7 @@ class Pf800(ParticleFilter):
     posterior as ``pf500`` is."""
 
     name = "pf800"
+    associates = True
 
     def __init__(self, believed: Believed, *, particles: Particles = 800, **options: Any) -> None:
         super().__init__(believed, particles=particles, **options)

@@ -39,6 +39,8 @@ def importance_density(
     cloud = moments(process, particles, log_weights.exp())
     covariance = cloud.covariance + torch.diag(floor.to(cloud.covariance.device) ** 2)
     prior = Prediction(cloud.mean.double(), covariance, now.observation, now.belief.memory)
+    if now.association is not None:
+        prior = now.association.named(prior)
     return ImportanceDensity(prior, iterated_update(prior, now.neighbours, screen, _ITERATIONS))
 
 

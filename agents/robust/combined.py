@@ -11,13 +11,19 @@ from agents.models.measurements import Block, Measurement
 from agents.models.process import Process
 from agents.robust.cross import CrossValidation
 from agents.robust.gate import gate_weights, residual_gate_weights
+from agents.robust.heavy_tails import mixture_weights, student_weights
 from agents.robust.huber import huber_weights
 from agents.robust.ransac import consensus_weights
 from agents.robust.screen import Prediction, Screen, Trust
 from agents.robust.temporal import TemporalConsistency
 from coloc_env.observation import Observation
 
-METHODS = ("huber", "gate", "ransac", "temporal", "cross")
+SOFT: dict[str, Callable[[Block], Float[Tensor, "B N m"]]] = {
+    "huber": huber_weights,
+    "student": student_weights,
+    "mixture": mixture_weights,
+}
+METHODS = (*SOFT, "gate", "ransac", "temporal", "cross")
 _STEP = 0.1  # what a step counts in the running share of measurements left out
 _MOST = 0.5  # the share beyond which it is not the measurements that are wrong
 Test = Sequence[Float[Tensor, "B N m"] | None]  # weights for each block, None for no objection
@@ -36,7 +42,8 @@ class Verdict:
 class RobustScreen(Screen):
     """Any of ``METHODS``, joined by ``+``; ``none`` trusts everything.
 
-    ``huber`` reweights at every iteration. The others are hard tests of the innovations, made once
+    ``huber`` reweights at every iteration, or in its place ``student`` or ``mixture`` (see
+    ``heavy_tails``). The others are hard tests of the innovations, made once
     per step, and a measurement stays if it passes all of them. Where the prior is broad, passing
     the ``gate`` (χ² quantile ``probability``) means little; there it judges again at the last
     iteration, by the residuals that are left. Where the tests go on leaving out most of what a
@@ -52,7 +59,9 @@ class RobustScreen(Screen):
         self.probability = probability
         self.judges = bool(self.methods)
         self.extra = 3 if self.judges else 0
-        self.hard = bool(self.methods - {"huber"})
+        self.hard = bool(self.methods - SOFT.keys())
+        soft = self.methods & SOFT.keys()
+        self.soft = SOFT[min(soft)] if soft else None
         remembers = "temporal" in self.methods and bool(models)
         self.temporal = TemporalConsistency(process, models) if remembers else None
         self.cross = CrossValidation(process, models) if "cross" in self.methods else None
@@ -104,7 +113,7 @@ class RobustScreen(Screen):
         return tests
 
     def weigh(self, blocks: Sequence[Block], evidence: Verdict | None, last: bool) -> list[Trust]:
-        soft = [huber_weights(block) if "huber" in self.methods else None for block in blocks]
+        soft = [None if self.soft is None else self.soft(block) for block in blocks]
         if evidence is None:
             return [Trust(weight) for weight in soft]
         hard = evidence.weights
@@ -137,4 +146,6 @@ def _parsed(robust: str) -> frozenset[str]:
         raise ValueError(
             f"robust={robust!r} is not allowed: none, or some of {', '.join(METHODS)} joined by +"
         )
+    if len(set(names) & SOFT.keys()) > 1:
+        raise ValueError(f"robust={robust!r} is not allowed: at most one of {', '.join(SOFT)}")
     return frozenset(names)

@@ -21,7 +21,7 @@ _BROAD = 0.5  # m per axis: a prior wider than that knows too little to judge me
 
 @dataclass(frozen=True)
 class Trust:
-    """For a block of m measurements: weights in [0, 1] of their information (1 where None), and
+    """For a block of m measurements: weights ≥ 0 of their information (1 where None), and
     ``shift``, a bias that is taken off the residuals (in the measurement's unit)."""
 
     weight: Float[Tensor, "B N m"] | None = None

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from agents.association import AssociationName
 from agents.bank import BankOptions
 from agents.bank.kalman_fallback import KalmanFallback
 from agents.localizer import Localizer
@@ -16,7 +17,8 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
 
     The networks of ``ekf_trust`` judge by a Gaussian update at the cloud's moments; their weights
     and biases enter every particle's likelihood. ``bank``, ``weights``: as ``ekf_trust`` has them,
-    but that the branch beside the particles is ``ekf:robust=huber``; other options as ``apf``.
+    but that the branch beside the particles is ``ekf:robust=huber``. ``association``: as ``ekf``
+    has it, at the cloud's moments; other options as ``apf``.
     """
 
     name = "pf_trust"
@@ -27,9 +29,10 @@ class TrustingParticleFilter(AdaptiveParticleFilter):
         *,
         weights: str = "auto",
         bank: BankOptions = BankOptions(),  # noqa: B008
+        association: AssociationName = "joint",
         **options: Any,
     ) -> None:
-        super().__init__(believed, **options)
+        super().__init__(believed, association=association, **options)
         if self.printed:
             raise ValueError("variant=paper trusts all measurements alike: apf and pfnn have it")
         self.screen = learned_screen(self.process, self.models, weights, bank.bank, options)

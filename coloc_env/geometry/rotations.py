@@ -102,6 +102,15 @@ def yaw_quaternion(yaw: Float[Tensor, "*s"]) -> Float[Tensor, "*s 4"]:
     return join(((0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()))
 
 
+def level(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s a"]:
+    """The attitude turned about the world's vertical so that its heading is 0: roll and pitch."""
+    if attitude.shape[-1] == 1:
+        return torch.zeros_like(attitude)
+    forward = rotation_matrix(attitude)[..., 0]
+    yaw = plane_angle(forward[..., 0], forward[..., 1])
+    return quaternion_product(yaw_quaternion(-yaw), attitude)
+
+
 def plane_angle(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
     """Angle of (x, y) in (-π, π], like ``atan2(y, x)``.
 

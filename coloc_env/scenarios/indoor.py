@@ -17,9 +17,9 @@ from coloc_env.motion import (
 from coloc_env.network import WalledNetworkOptions
 from coloc_env.options import PositiveCount, PositiveMetres, PositiveSeconds, PositiveSpeed
 from coloc_env.scenario import (
+    AttitudePriorOptions,
     ConstantVelocity,
     Inertial,
-    PriorOptions,
     Process,
     Scenario,
     TeamOptions,
@@ -76,7 +76,7 @@ def indoor(
     gusts: GustOptions = GustOptions(),
     kidnap: KidnapOptions = KidnapOptions(),
     control: ControlOptions = ControlOptions(),
-    prior: PriorOptions = PriorOptions(),
+    prior: AttitudePriorOptions = AttitudePriorOptions(),
 ) -> Scenario:
     """UAVs in a room, with an IMU, landmarks seen as body-frame vectors, and UWB between all UAVs.
 
@@ -88,6 +88,8 @@ def indoor(
     """
     if anchors.nlos_anchor is not None and not anchors.anchors:
         raise ValueError(f"nlos_anchor={anchors.nlos_anchor} is not allowed: there are no anchors")
+    if landmarks.association == "unknown" and not mapping.landmarks_known:
+        raise ValueError("association=unknown is not allowed with landmarks_known=false")
     arena = Arena(3, team.n_uavs, dt, (0.0, 0.0, 0.0), room)
     radio = network.network(wall_loss=math.inf if sight.wall_delay == math.inf else 0.0)
     inside, path = sight.sight(radio.walls), gusts.of(_around(MOTIONS[motion], radio.walls))
@@ -100,8 +102,9 @@ def indoor(
         true.append(imu.true)
         believed.append(imu.believed)
         process = Inertial(imu.accel_bias, imu.gyro_bias) if imu.estimated else Inertial()
-    true += mapping.of(landmarks.behind(inside))
-    believed += mapping.of(landmarks.believed)
+    seen = landmarks.named if mapping.landmarks_known else mapping.of
+    true += seen(landmarks.behind(inside))
+    believed += seen(landmarks.believed)
     arms = tags.arms(team.n_uavs)
     if uwb:
         true.append(Ranging(ranges.true, arms, ranges.uwb_delay, sight=inside))
@@ -124,7 +127,7 @@ def indoor(
         motion=control.of(kidnap.of(path, dt), v_max, radio.walls),
         sensors=tuple(true),
         network=radio,
-        prior=prior.at_start(),
+        prior=prior.with_attitude(),
         process=process,
         believed_sensors=tuple(believed),
         failure_rate=team.failure_rate,

@@ -24,6 +24,7 @@ from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
 from coloc_env.sensors.ultrasonic import Ultrasonic, UltrasonicOptions
+from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
 from coloc_env.sensors.unmapped import MapOptions, UnmappedLandmarks
 
 __all__ = [
@@ -83,6 +84,7 @@ __all__ = [
     "UavRssi",
     "Ultrasonic",
     "UltrasonicOptions",
+    "UnlabelledLandmarks",
     "UnmappedLandmarks",
     "Window",
 ]

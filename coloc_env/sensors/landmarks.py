@@ -3,19 +3,32 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import rotate, rotation_matrix
-from coloc_env.options import Count, Group, Metres, PositiveMetres, Quantity, Seconds, Share
+from coloc_env.options import (
+    Count,
+    Group,
+    Metres,
+    PositiveMetres,
+    PositiveSeconds,
+    Quantity,
+    Seconds,
+    Share,
+)
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, usable
+from coloc_env.sensors.errors.persistence import held_uniform
 from coloc_env.sensors.sight import Sight
+from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
 
 FieldOfView = Annotated[float, Quantity("rad", above=0.0, most=2 * math.pi)]
+Placement = Literal["random", "symmetric"]
+Association = Literal["known", "unknown"]
 
 
 def uniform_points(keys: Int64[Tensor, "R"], stream: str, count: int, layout: Layout) -> Tensor:
@@ -32,10 +45,14 @@ class Landmarks(Sensor):
 
     Entry ``l`` is z = Rᵀ(L_l − p) + N(0, std² I), body frame, metres, for landmarks within
     ``radius``; landmarks are drawn uniformly in the arena for every world unless ``positions``
-    gives them. ``false_matches``: fraction of measurements that belong to another landmark;
-    ``dropout``: fraction that is missing; ``off``: times (from, to) in s without any.
-    ``field_of_view``: full opening angle (rad) of the cone about the body's x axis in which they
-    are seen (None: all around; in the plane a sector). ``sight``: what hides them.
+    gives them; with ``placement="symmetric"`` every second one is where half a turn about the
+    arena's vertical axis takes the one before, and the last of an odd number on that axis.
+    ``false_matches``: fraction of measurements that belong to another landmark, drawn in every
+    step, or, with ``alias_time``, to the same one for that long (s; a Markov chain whose
+    correlation falls by e in that time); ``dropout``: fraction that is missing; ``off``: times
+    (from, to) in s without any. ``field_of_view``: full opening angle (rad) of the cone about the
+    body's x axis in which they are seen (None: all around; in the plane a sector). ``sight``: what
+    hides them.
     """
 
     count: int = 20
@@ -47,6 +64,8 @@ class Landmarks(Sensor):
     positions: tuple[tuple[float, ...], ...] | None = None
     field_of_view: float | None = None
     sight: Sight = field(default_factory=Sight)
+    alias_time: float | None = None
+    placement: Placement = "random"
 
     def __post_init__(self) -> None:
         require(
@@ -56,6 +75,10 @@ class Landmarks(Sensor):
         require(self.radius > 0, self, "radius", "a distance in m > 0")
         for name in ("false_matches", "dropout"):
             require(0 <= getattr(self, name) <= 1, self, name, "a fraction in [0, 1]")
+        lasting = self.alias_time is None or 0 < self.alias_time < float("inf")
+        require(lasting, self, "alias_time", "a time in s > 0")
+        kinds = get_args(Placement)
+        require(self.placement in kinds, self, "placement", f"one of {', '.join(kinds)}")
         require(
             self.off is None or self.off[0] <= self.off[1],
             self,
@@ -88,7 +111,9 @@ class Landmarks(Sensor):
 
     def place(self, keys: Int64[Tensor, "R"], layout: Layout) -> dict[str, Tensor]:
         if self.positions is None:
-            return {"positions": uniform_points(keys, "landmarks.place", self.count, layout)}
+            drawn = uniform_points(keys, "landmarks.place", self.count, layout)
+            symmetric = self.placement == "symmetric"
+            return {"positions": _half_turned(drawn, layout) if symmetric else drawn}
         given = torch.tensor(self.positions, dtype=torch.float64, device=keys.device)
         shape = (self.count, layout.arena.dim)
         require(
@@ -121,8 +146,7 @@ class Landmarks(Sensor):
             hidden = self.sight.between(window, *ends) > 0
             visible.masked_fill_(hidden, 0.0)
         if self.false_matches:
-            draws = noise.uniform(keys, "landmarks.false", 2 * n * self.count)
-            wrong, other = draws.unflatten(-1, (2, n, self.count)).unbind(-3)
+            wrong, other = self._mistaken(window)
             index = torch.arange(self.count, device=keys.device)
             shift = 1 + (other * (self.count - 1)).to(torch.int64)
             index = torch.where(wrong < self.false_matches, (index + shift) % self.count, index)
@@ -156,15 +180,46 @@ class Landmarks(Sensor):
             forward.addcmul_(rotation[..., row, 0, None], apart[row])
         return forward >= math.cos(0.5 * self.field_of_view) * squared.sqrt()
 
+    def _mistaken(
+        self, window: Window
+    ) -> tuple[Float32[Tensor, "R K N L"], Float32[Tensor, "R K N L"]]:
+        """Numbers in (0, 1): where the first is below the share of false matches the landmark is
+        taken for another, which the second chooses."""
+        n = window.layout.arena.n_uavs
+        if self.alias_time is None:
+            draws = noise.uniform(window.keys, "landmarks.false", 2 * n * self.count)
+            wrong, other = draws.unflatten(-1, (2, n, self.count)).unbind(-3)
+            return wrong, other
+        links = torch.arange(n * self.count, device=window.keys.device).view(n, self.count)
+        first, count = window.steps[:, 0], window.steps.shape[1]
+        time = self.alias_time / window.layout.arena.dt
+        wrong = held_uniform(window.rows, first, count, links, "landmarks.alias", time)
+        return wrong, (wrong / self.false_matches).clamp_max(1 - 2**-23)
+
+
+def _half_turned(points: Float64[Tensor, "R L d"], layout: Layout) -> Float64[Tensor, "R L d"]:
+    """Every second point where half a turn about the arena's vertical axis takes the one before;
+    the last of an odd number on that axis."""
+    arena = layout.arena
+    ends = zip(arena.low[:2], arena.high[:2], strict=True)
+    centre = points.new_tensor([0.5 * (low + high) for low, high in ends])
+    first = points[:, ::2].clone()
+    if points.shape[1] % 2:
+        first[:, -1, :2] = centre
+    turned = torch.cat((2 * centre - first[..., :2], first[..., 2:]), -1)
+    return torch.stack((first, turned), 2).flatten(1, 2)[:, : points.shape[1]]
+
 
 @dataclass(frozen=True)
 class LandmarkOptions(Group):
-    """So many ``landmarks`` stand anywhere in the arena; those within ``landmark_radius`` m are
-    seen as position vectors with noise of ``landmark_std`` m per axis. A share ``false_matches`` of
-    these belongs to another landmark, a share ``landmark_dropout`` is missing, and in the times
-    ``range_only`` (from, to) none is seen. ``landmark_field``: full opening angle of the cone about
-    the body's x axis in which they are seen (none: all around). The team believes the Gaussian part
-    alone.
+    """So many ``landmarks`` stand anywhere in the arena (``landmark_placement``: ``random``, or
+    ``symmetric``: unchanged by half a turn about the arena's vertical axis); those within
+    ``landmark_radius`` m are seen as position vectors with noise of ``landmark_std`` m per axis.
+    With ``association=unknown`` nothing says which landmark a vector is to. A share
+    ``false_matches`` of these belongs to another landmark, in each step by chance or the same one
+    over ``alias_time`` s, a share ``landmark_dropout`` is missing, and in the times ``range_only``
+    (from, to) none is seen. ``landmark_field``: full opening angle of the cone about the body's x
+    axis in which they are seen (none: all around). The team believes the Gaussian part alone.
     """
 
     title: ClassVar[str] = "landmarks"
@@ -176,12 +231,18 @@ class LandmarkOptions(Group):
     landmark_dropout: Share = 0.0
     range_only: tuple[Seconds, Seconds] | None = None
     landmark_field: FieldOfView | None = None
+    association: Association = "known"
+    alias_time: PositiveSeconds | None = None
+    landmark_placement: Placement = "random"
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
-        """The sensor as it is, with nothing in the way; nothing without landmarks."""
-        seen = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
-        return tuple(replace(one, field_of_view=self.landmark_field) for one in seen)
+        """The sensor as it is, by landmarks with names and with nothing in the way."""
+        wrong = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
+        ahead, lasting, where = self.landmark_field, self.alias_time, self.landmark_placement
+        return tuple(
+            replace(one, field_of_view=ahead, alias_time=lasting, placement=where) for one in wrong
+        )
 
     def behind(self, sight: Sight) -> tuple[Landmarks, ...]:
         """The sensor as it is, with what hides landmarks."""
@@ -189,8 +250,14 @@ class LandmarkOptions(Group):
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:
-        """The sensor that the team believes in; nothing without landmarks."""
+        """The sensor that the team believes in, by landmarks with names."""
         return self._seen()
+
+    def named(self, seen: tuple[Landmarks, ...]) -> tuple[Sensor, ...]:
+        """The landmarks as they are seen: with names, or without."""
+        if self.association == "known":
+            return seen
+        return tuple(UnlabelledLandmarks(one) for one in seen)
 
     def _seen(self, *wrong: Any) -> tuple[Landmarks, ...]:
         if not self.landmarks:

@@ -50,6 +50,7 @@ from coloc_env.sensors import (
     UavBearings,
     UavRssi,
     Ultrasonic,
+    UnlabelledLandmarks,
 )
 from coloc_env.sensors.base import usable
 
@@ -105,10 +106,11 @@ MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     UavBearings: UavRangeBearings,
     UavRssi: UavStrengths,
     Ultrasonic: WallDistances,
+    UnlabelledLandmarks: LandmarkVectors,
 }
 _BODY_FRAME = (
     *(ArrivalAngles, Compass, Landmarks, LandmarkBearings, Light, Magnetic, OpticalFlow),
-    *(UavBearings, Ultrasonic),
+    *(UavBearings, Ultrasonic, UnlabelledLandmarks),
 )
 
 

@@ -19,16 +19,17 @@ from agents.models.measurements.base import (
 from agents.models.process import Process
 from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
-from coloc_env.sensors import Height, Landmarks, PositionFix, SlowFlight
+from coloc_env.sensors import Height, Landmarks, PositionFix, SlowFlight, UnlabelledLandmarks
 from coloc_env.sensors.base import usable
 
 
 class LandmarkVectors(Measurement):
-    """z = Rᵀ(L − p) + noise for known landmarks."""
+    """z = Rᵀ(L − p) + noise for known landmarks; where they come without names, ``association``
+    gives them some before."""
 
     mask_leaf = "landmark_mask"
 
-    def __init__(self, sensor: Landmarks) -> None:
+    def __init__(self, sensor: Landmarks | UnlabelledLandmarks) -> None:
         self.std = noise_std(sensor.std)
 
     def read(

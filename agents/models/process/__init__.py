@@ -49,6 +49,7 @@ def make_process(believed: Believed) -> Process:
     process, height = _process(believed), believed.sensor(Height)
     if height is not None and height.estimated and height.bias_std:
         process = DriftingProcess(process, height)
+    process.any_yaw = believed.prior.yaw == "uniform"
     process.vague = max(process.vague, _VAGUE * math.dist(believed.arena.low, believed.arena.high))
     return process
 

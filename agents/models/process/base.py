@@ -1,5 +1,6 @@
 """What every motion model gives."""
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
@@ -11,6 +12,7 @@ from agents.models.rotations import rotate_by, rotation_between
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 
+UNIFORM_YAW = math.pi / math.sqrt(3)  # rad, standard deviation of a heading that may be any
 LEAST_STD = 1e-6  # m, m/s, rad, and of biases: of a prior, whose covariance must have an inverse
 
 
@@ -18,7 +20,7 @@ class Process(ABC):
     """A motion model. ``attitude_error`` is the attitude's slice of the error, if it is a state;
     ``drift_size``: how many states, the last ones, are biases of what measures heights;
     ``vague`` (m per axis) the position's standard deviation beyond which measurements are not
-    linearized all at once."""
+    linearized all at once; ``any_yaw``: nothing is known of the heading at the start."""
 
     state_size: int
     error_size: int
@@ -27,6 +29,7 @@ class Process(ABC):
     drift_size: int = 0
     attitude_error: slice | None = None
     vague: float = 0.5
+    any_yaw: bool = False
 
     def __init__(self, dim: int, dt: float) -> None:
         self.dim, self.dt = dim, dt
@@ -66,7 +69,21 @@ class Process(ABC):
         parts = [std[..., :d], std[..., d : d + 1].expand_as(std[..., :d])]
         if self.attitude_size:
             parts.append(std[..., d + 1 :].expand(*std.shape[:-1], d if d == 3 else 1))
-        return self._initial(mean, torch.cat(parts, -1))
+        x, covariance = self._initial(mean, torch.cat(parts, -1))
+        if self.any_yaw and self.attitude_error is not None:
+            e = self.attitude_error
+            covariance[..., e, e] = self._of_any_yaw(x, covariance[..., e, e])
+        return x, covariance
+
+    def _of_any_yaw(
+        self, x: Float[Tensor, "*s S"], covariance: Float[Tensor, "*s t t"]
+    ) -> Float[Tensor, "*s t t"]:
+        """The attitude's covariance, but π²/3 about the vertical u: P + u uᵀ (π²/3 − uᵀ P u)."""
+        rotation = self.rotation(x)
+        assert rotation is not None
+        up = rotation[..., -1, :] if self.dim == 3 else torch.ones_like(covariance[..., 0])
+        along = (up.unsqueeze(-2) @ covariance @ up.unsqueeze(-1))[..., 0]
+        return covariance + up.unsqueeze(-1) * (up * (UNIFORM_YAW**2 - along)).unsqueeze(-2)
 
     def _initial(
         self, mean: Float[Tensor, "*s W"], std: Float[Tensor, "*s E"]
