@@ -82,6 +82,8 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "sight_few": indoor(uwb=False, landmarks=4),
     "sight_uniform": indoor(uwb=False, prior="uniform"),
     "sight_bias": indoor(uwb=False, imu_bias=True, n_uavs=20),
+    "unnamed": indoor(association="unknown"),
+    "any_yaw": indoor(prior_yaw="uniform"),
     "plane": plane,
     "tags": tags,
     "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, uwb_dropout=0.2),
@@ -97,6 +99,9 @@ VARIANTS = (
     "ekf:robust=ransac",
     "ekf:robust=temporal",
     "ekf:robust=cross",
+    "ekf:robust=student",
+    "ekf:robust=mixture",
+    "pf500:likelihood=student",
     f"ekf:robust={ALL}:fusion=ci",
     f"ekf_joint:robust={ALL}",
     "ekf:fusion=ci",
@@ -125,6 +130,7 @@ CHOSEN = {
     "dfgo_central": ("default", "imu_bias", "plane"),
     "dlspf": ("default", "uniform", "imu_bias", "anchors", "slots", "tags"),
     "ukf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
+    "mhekf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "unnamed", "any_yaw"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
@@ -139,7 +145,7 @@ CHOSEN = {
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
-SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
+SPECIAL = ("unnamed", "any_yaw", "wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
 SPECIAL = (*SPECIAL, "late", "biased", "sight", "sight_few", "sight_uniform", "sight_bias")
 ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
 CASES = [
@@ -149,6 +155,9 @@ CASES = [
     *((f"ekf:fusion={f}", "tags") for f in ("ci", "pairwise", "exchange")),
     *((f"ekf:fusion={f}", "late") for f in ("ci", "pairwise", "exchange")),
     *((n, "wsn") for n in ("pf", "ekf")),
+    *((n, "unnamed") for n in ("ekf", "ekf:association=nearest", "apf", "ekf:robust=temporal")),
+    *((n, "any_yaw") for n in ("ekf", "apf", "ukf")),
+    *((n, "unnamed") for n in ("pf500", "pf500:association=joint", "pf_trust", "ekf_trust")),
     *((n, "biased") for n in ("ekf", "ekf_joint", "ekf:fusion=pairwise")),
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),

@@ -35,6 +35,9 @@ LANDMARKS: dict[str, Any] = {
     "false_matches": 0.5,
     "landmark_dropout": 0.5,
     "range_only": (0.0, 1.0),
+    "association": "unknown",
+    "alias_time": 3.0,
+    "landmark_placement": "symmetric",
 }
 INS: dict[str, Any] = {"ins_std": 1.0, "ins_bias": 1.0, "ins_bias_time": 5.0}
 PRIOR: dict[str, Any] = {"prior": "uniform", "prior_std": 9.0, "max_speed": 2.0}
@@ -127,6 +130,8 @@ CHANGED: dict[str, dict[str, Any]] = {
         **CONTROL,
         "v_max": 2.0,
         **PRIOR,
+        "prior_attitude_std": 0.4,
+        "prior_yaw": "uniform",
         "comm_radius": 3.0,
     },
     "wsn-v0": {
@@ -208,6 +213,7 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **STEERED,
         "v_max": {"control": "velocity"},
         "nlos_anchor": {"anchors": 2},
+        "alias_time": {"false_matches": 0.5},
         "kidnapped": {"kidnap_at": 0.2},
         "accel_bias": {"imu_bias": True},
         "gyro_bias": {"imu_bias": True},
