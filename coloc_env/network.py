@@ -65,8 +65,8 @@ class Network:
         require(self.links in kinds, self, "links", f"one of {', '.join(kinds)}")
         near = self.interference is None or self.interference > 0
         require(near, self, "interference", "a distance in m > 0")
-        known = self.wall_loss == math.inf or self.radius is not None
-        require(known, self, "wall_loss", "infinite, unless there is a radius")
+        known = self.wall_loss in (0.0, math.inf) or self.radius is not None
+        require(known, self, "wall_loss", "0 or infinite, unless there is a radius")
 
     def slots(self, n_uavs: int) -> int:
         """Neighbour slots of every UAV: its own index included where each UAV has one."""
@@ -137,7 +137,7 @@ class Network:
     ) -> Bool[Tensor, "R K N S"]:
         """``reach`` without the links that are broken in each step, and those that do not get
         through a wall: the same ones at both ends."""
-        fading = bool(self.walls) and not self._opaque
+        fading = bool(self.walls) and not self._opaque and self.radius is not None
         if not (self.failure or fading):
             return reach
         n = reach.shape[2]
@@ -215,8 +215,8 @@ class NetworkOptions(Group):
 
 @dataclass(frozen=True)
 class WalledNetworkOptions(NetworkOptions):
-    """``walls``: boxes ``x0,y0,z0,x1,y1,z1`` (several: one after the other) that no signal passes.
-    In teams of more than ``max_neighbours`` each UAV has as many, the nearest."""
+    """``walls``: solid boxes ``x0,y0,z0,x1,y1,z1`` (several: one after the other). In teams of more
+    than ``max_neighbours`` each UAV has as many, the nearest."""
 
     max_neighbours: PositiveCount = 16
     walls: tuple[Coordinate, ...] | None = None

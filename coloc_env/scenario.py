@@ -10,7 +10,7 @@ from coloc_env.motion import Arena, Motion
 from coloc_env.network import Links, Network
 from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Radians, Share
 from coloc_env.reference import SatelliteReference
-from coloc_env.sensors import Sensor
+from coloc_env.sensors import Sensor, Sight
 from coloc_env.sensors.base import Layout, require
 
 Reward = Literal["error", "squared", "team", "log_score"]
@@ -237,6 +237,12 @@ class Scenario:
     def layout(self) -> Layout:
         """What fixes the widths of observation leaves."""
         return Layout(self.arena, self.network.slots(self.arena.n_uavs))
+
+    @cached_property
+    def sight(self) -> Sight:
+        """What stands in the way of the sensors' signals; nothing where no sensor minds."""
+        found = (getattr(sensor, "sight", None) for sensor in self.sensors)
+        return next((sight for sight in found if sight is not None), Sight())
 
     @property
     def commanded(self) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
@@ -300,6 +300,14 @@ class World:
     def static(self) -> dict[str, Float32[Tensor, "B N F"]]:
         """Leaves that stay the same over an episode."""
         return {name: self._static[name] for name in self._static_names}
+
+    @property
+    def obstacles(self) -> Float64[Tensor, "B C d"]:
+        """Where what moves in the way of signals is (m) at the current step; privileged."""
+        sight, arena = self.scenario.sight, self.scenario.arena
+        if not sight.obstacles:
+            return self.truth.position[:, :0]
+        return sight.places(self._keys, self.step_index.unsqueeze(-1), arena)[:, 0]
 
     def state(self) -> Float32[Tensor, "B S"]:
         """The privileged truth, flat: per UAV position, velocity, attitude, alive, scored."""

@@ -147,7 +147,7 @@ class JointEkf(Localizer[GaussianBelief]):
         broad = self._broad(prior)
         extra = self.screen.extra if bool(broad.any()) else 0
         for iteration in range(-extra, self.iterations):
-            blocks = self._blocks(state, observation)
+            blocks = self._blocks(state, prior)
             if self.second_order:
                 blocks = self._expanded(blocks, p, observation)
             judged = blocks
@@ -169,7 +169,7 @@ class JointEkf(Localizer[GaussianBelief]):
             own, shared = by_kind(self.models)
             model = Estimation(
                 lambda at, cooperative: pick(
-                    self._blocks(at, observation), shared if cooperative else own
+                    self._blocks(at, prior), shared if cooperative else own
                 ),
                 self._information,
                 lambda at, delta: self.process.boxplus(at, delta.unflatten(-1, (n, e))),
@@ -183,7 +183,7 @@ class JointEkf(Localizer[GaussianBelief]):
             gain = updated @ self._by_bias(blocks, trusts, observation)
             kept = kept_share(p, updated)
             considered = self.biases.update(considered, kept, gain, observation)
-        memory = self.screen.remember(prior, evidence, lambda: self._blocks(state, observation))
+        memory = self.screen.remember(prior, evidence, lambda: self._blocks(state, prior))
         return state, updated, memory, considered
 
     def _considered(
@@ -214,12 +214,16 @@ class JointEkf(Localizer[GaussianBelief]):
         own = cross.diagonal(dim1=1, dim2=2).movedim(-1, 1)
         return own.unsqueeze(2) + own.unsqueeze(1) - cross - cross.mT
 
-    def _blocks(self, x: Float[Tensor, "B N S"], observation: Observation) -> list[Block]:
+    def _blocks(self, x: Float[Tensor, "B N S"], prior: Prediction) -> list[Block]:
+        observation, d = prior.observation, self.process.dim
         neighbours, heard = self._neighbours(x), _heard(observation)
         if heard is not None:
             known = neighbours.known & heard.unsqueeze(1)
             neighbours = replace(neighbours, known=known)
-        blocks = [m.linearize(self.process, x, observation, neighbours) for m in self.models]
+        known = prior.covariance[..., :d, :d]
+        blocks = [
+            m.linearize(self.process, x, observation, neighbours).curved(known) for m in self.models
+        ]
         if heard is None:
             return blocks
         return [replace(block, mask=block.mask & heard.unsqueeze(-1)) for block in blocks]

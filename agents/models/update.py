@@ -66,8 +66,11 @@ def iterated_update(
     broad = prior.broad(process.dim).unsqueeze(-1)
     extra = screen.extra if bool(broad.any()) else 0
 
+    known = covariance[..., : process.dim, : process.dim]
+
     def linearize(at: Tensor, models: Sequence[Measurement]) -> list[Block]:
-        return [m.linearize(process, at, prior.observation, neighbours) for m in models]
+        blocks = [m.linearize(process, at, prior.observation, neighbours) for m in models]
+        return [block.curved(known) for block in blocks]
 
     for iteration in range(-extra, iterations):
         blocks = linearize(state, screen.models)
@@ -108,7 +111,10 @@ def expanded_update(prior: Prediction, neighbours: Neighbours, screen: Screen) -
 
     def linearize(at: Tensor) -> list[Block]:
         seen = prior.observation
-        linear = [m.linearize(process, at, seen, neighbours) for m in screen.models]
+        linear = [
+            m.linearize(process, at, seen, neighbours).curved(own[..., 0, :, :])
+            for m in screen.models
+        ]
         return [
             expanded(m, block, own, seen) for m, block in zip(screen.models, linear, strict=True)
         ]

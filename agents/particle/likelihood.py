@@ -141,16 +141,19 @@ def log_likelihood(
         squared = trust.residual(block) ** 2 / variance
         if tails is not None:
             each = tails(squared.sum(-1), squared.shape[-1])
-            if block.partner_variance is not None:
+            if block.partner_variance is not None or block.varies:
                 each = each - 0.5 * variance.log().sum(-1)
             each = each if trust.weight is None else each * trust.weight
             total = total + each.masked_fill(~block.mask, 0.0).sum(-1)
             continue
-        if block.partner_variance is not None:
+        if block.partner_variance is not None or block.varies:
             squared = squared + variance.log()
         if trust.weight is not None:
             squared = squared * trust.weight.unsqueeze(-1)
-        total = total - 0.5 * squared.sum(-1).masked_fill(~block.mask, 0.0).sum(-1)
+        log_density = -0.5 * squared.sum(-1)
+        if block.stray:
+            log_density = (log_density.exp() + block.stray).log()
+        total = total + log_density.masked_fill(~block.mask, 0.0).sum(-1)
     return total
 
 

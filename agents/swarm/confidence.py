@@ -6,6 +6,7 @@ each link from step to step.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -19,6 +20,7 @@ from agents.swarm.calibration import ErrorModel
 from agents.swarm.links import lengths
 
 ConfidenceKind = Literal["none", "huber", "em", "paper"]
+SolvedKind = Literal[ConfidenceKind, "gnc"]  # for solutions of several iterations
 _ENOUGH = 50.0  # remembered errors of links between anchors: with fewer, all links are used
 Weights = tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
 
@@ -32,6 +34,13 @@ class Confidence(ABC):
     @abstractmethod
     def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
         """Each link's weight W_ij (1/m²) and shift (m) at its residual (m)."""
+
+    def schedule(
+        self, inputs: StepInput, iterations: int
+    ) -> tuple[Callable[[Float64[Tensor, "B N N"]], Weights], int]:
+        """``weights`` for the successive iterations of one solution, and how many it takes where
+        ``iterations`` are asked for."""
+        return lambda residual: self.weights(residual, inputs), iterations
 
     def initial_memory(self, model: ErrorModel, shape: torch.Size) -> Float64[Tensor, "B N L"]:
         """What is remembered of links before the first step."""
@@ -98,6 +107,31 @@ class PaperConfidence(HuberConfidence):
     ) -> Float64[Tensor, "B N N"]:
         assert inputs.packet_loss is not None
         return inputs.packet_loss
+
+
+class GncConfidence(Confidence):
+    """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas & Carlone, RA-L
+    2020): ranges beyond three deviations are outliers."""
+
+    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+        """Those of the truncated loss itself."""
+        weight, shift = weights.uniform(residual, inputs.links.mask, self.std)
+        return weight * ((residual / self.std).square() < weights.TRUNCATED), shift
+
+    def schedule(
+        self, inputs: StepInput, iterations: int
+    ) -> tuple[Callable[[Float64[Tensor, "B N N"]], Weights], int]:
+        """The surrogate's weights, from nearly convex (μ small) to nearly the truncated loss."""
+        mu: Float64[Tensor, "B 1 1"] | None = None
+
+        def graduated(residual: Float64[Tensor, "B N N"]) -> Weights:
+            nonlocal mu
+            squared = (residual / self.std).square().masked_fill(~inputs.links.mask, 0.0)
+            mu = weights.first_mu(squared) if mu is None else weights.GRADUATION * mu
+            weight, shift = weights.uniform(residual, inputs.links.mask, self.std)
+            return weight * weights.truncated(squared, mu), shift
+
+        return graduated, max(iterations, weights.GRADUATIONS)
 
 
 class EmConfidence(Confidence):
@@ -195,9 +229,10 @@ class EmConfidence(Confidence):
         }
 
 
-CONFIDENCES: dict[ConfidenceKind, type[Confidence]] = {
+CONFIDENCES: dict[SolvedKind, type[Confidence]] = {
     "none": UniformConfidence,
     "huber": HuberConfidence,
     "em": EmConfidence,
     "paper": PaperConfidence,
+    "gnc": GncConfidence,
 }

@@ -14,7 +14,7 @@ from agents.models.process import make_process
 from agents.registry import NotServed
 from agents.swarm import calibration, delays, ins_bias, joint, joint_bias, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
-from agents.swarm.confidence import CONFIDENCES, ConfidenceKind, Weights
+from agents.swarm.confidence import CONFIDENCES, SolvedKind, Weights
 from agents.swarm.considered import Moments, after_step
 from agents.swarm.dead_reckoning import DeadReckoning, Predicted
 from agents.swarm.links import Links, connected, lengths, links_of, of_both_ends
@@ -55,7 +55,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
     def __init__(
         self,
         believed: Believed,
-        confidence: ConfidenceKind,
+        confidence: SolvedKind,
         bias: bool = False,
         delays: bool = False,
     ) -> None:
@@ -251,8 +251,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def weights_at(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
         """The same at residuals (m)."""
-        weight, shift = self.confidence.weights(residual, inputs)
-        return (weight if inputs.confidence is None else inputs.confidence * weight), shift
+        return scaled(self.confidence.weights(residual, inputs), inputs.confidence)
 
     def _pair_variance(self, at: Predicted) -> Float64[Tensor, "B N N"]:
         """Of the vectors between the priors (m² per axis)."""
@@ -280,6 +279,12 @@ class SwarmFilter(Localizer[SwarmBelief]):
             at.process_noise.masked_fill(at.fixed, at.fix_variance),
             window.fading(self.decay_rate(at.process_noise, at.fixed, at.dt), at.dt),
         )
+
+
+def scaled(found: Weights, confidence: Float64[Tensor, "B N N"] | None) -> Weights:
+    """Weights times what links are trusted beside."""
+    weight, shift = found
+    return (weight if confidence is None else confidence * weight), shift
 
 
 def _per_uav(x: Float64[Tensor, "B *s"], shape: torch.Size) -> Float64[Tensor, "B N *s"]:

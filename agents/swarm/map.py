@@ -13,7 +13,7 @@ from agents.swarm import delays as clocks
 from agents.swarm import joint, joint_bias
 from agents.swarm.anchored import supports_anchors
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
-from agents.swarm.confidence import ConfidenceKind
+from agents.swarm.confidence import SolvedKind
 from agents.swarm.expectation_propagation import (
     Cavity,
     Sites,
@@ -36,10 +36,12 @@ Adjust = Callable[[int, StepInput, Cavity, Sites], Sites]
 class RecursiveMap(JointGaussNewton):
     """Recursive maximum a posteriori with the team's full covariance.
 
-    ``confidence``: ``em``, ``huber``, ``paper`` or ``none``, as ``dwmds_st`` has them. With ``em``,
+    ``confidence``: ``em``, ``huber``, ``paper`` or ``none``, as ``dwmds_st`` has them; ``gnc``:
+    truncated least squares by graduated non-convexity (25 iterations at least). With ``em``,
     ``factors=ep`` approximates the factor of each range by expectation propagation, one
     Gauss–Newton iteration a pass; ``weights`` by the responsibilities at its residual, with
-    ``iterations`` a step. ``bias``: of the INS's biases the covariance with each other and with all
+    ``iterations`` a step, from so many ``starts`` (the prior, and draws from it), of which the best
+    counts. ``bias``: of the INS's biases the covariance with each other and with all
     positions is kept (``joint``), or each UAV's own alone (``own``); ``none``: they are not
     estimated. ``delays=false`` does not estimate what clocks and antennas add to ranges.
 
@@ -53,15 +55,20 @@ class RecursiveMap(JointGaussNewton):
         self,
         believed: Believed,
         *,
-        confidence: ConfidenceKind = "em",
+        confidence: SolvedKind = "em",
         factors: Literal["ep", "weights"] = "ep",
         iterations: PositiveCount = 3,
+        starts: PositiveCount = 1,
         bias: Literal["joint", "own", "none"] = "joint",
         delays: bool = True,
     ) -> None:
-        super().__init__(believed, confidence, iterations, bias != "none", delays)
+        super().__init__(believed, confidence, iterations, starts, bias != "none", delays)
         self.jointly_biased = bias == "joint" and self.ins is not None
         self.propagates = factors == "ep" and confidence == "em"
+        if self.propagates and starts > 1:
+            raise ValueError(
+                f"starts={starts} is not allowed with confidence=em and factors=ep: one start"
+            )
 
     def solve(
         self, belief: SwarmBelief, inputs: StepInput, adjust: Adjust | None = None

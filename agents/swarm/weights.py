@@ -5,6 +5,8 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 HUBER = 1.345  # standard deviations
+TRUNCATED = 9.0  # c̄²: normalized squared residuals from which on a range is an outlier
+GRADUATION, GRADUATIONS = 1.4, 25  # of μ, in each of so many iterations
 _FLAGGED = 3.0  # standard deviations from which on a residual is flagged as NLOS
 _NLOS, _LOSS, _C_MIN = 0.5, 0.3, 0.1  # coefficients of equation 17; the paper does not give c_min
 
@@ -27,6 +29,22 @@ def huber(
     scale = HUBER * (std**2 + variance).sqrt()
     weight = (scale / residual.abs().clamp_min(1e-12)).clamp_max(1.0)
     return weight * mask / std**2, torch.zeros_like(residual)
+
+
+def first_mu(squared: Float64[Tensor, "B N N"]) -> Float64[Tensor, "B 1 1"]:
+    """μ = c̄² / (2 r̂²_max − c̄²), of which the surrogate is convex at these normalized ``squared``
+    residuals r̂² (GNC, remark 5); large, which is the truncated loss, where all are inliers."""
+    most = squared.amax((-2, -1), keepdim=True)
+    return TRUNCATED / (2 * most - TRUNCATED).clamp_min(1e-3)
+
+
+def truncated(
+    squared: Float64[Tensor, "B N N"], mu: Float64[Tensor, "B 1 1"]
+) -> Float64[Tensor, "B N N"]:
+    """Weights of the truncated least squares' surrogate: 1 up to r̂² = μ/(μ+1) c̄², 0 from
+    (μ+1)/μ c̄² on, √(c̄² μ (μ+1) / r̂²) − μ between (GNC, equation 14)."""
+    between = (TRUNCATED * mu * (mu + 1) / squared.clamp_min(1e-12)).sqrt() - mu
+    return between.clamp(0.0, 1.0)
 
 
 def paper_confidence(

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from coloc_env.bounds.mixture import EXACT, distance_information, range_information
 from coloc_env.geometry import cross_matrix, rotation_matrix
-from coloc_env.geometry.walls import depth
+from coloc_env.geometry.walls import crossed, depth
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
 from coloc_env.sensors import (
@@ -33,6 +33,7 @@ from coloc_env.sensors import (
     RangeNoise,
     Ranging,
     Sensor,
+    Sight,
     Tdoa,
     UavBearings,
 )
@@ -121,8 +122,11 @@ def anchor_rows(
     toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
     rows = toward @ jacobian  # [B, N, T, A, D]
     each = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
+    if sensor.sight.walls:
+        anchors = _points(seen, "anchor_map", truth).unsqueeze(2)
+        each = each * _through(sensor.noise, sensor.sight, tags.unsqueeze(-2), anchors)
     if sensor.blocked:
-        each[list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
+        each[..., list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
     if sensor.noise.per_metre:
         points = _points(seen, "anchor_map", truth).unsqueeze(2)
         each = distance_information(sensor.noise, (tags.unsqueeze(-2) - points).norm(dim=-1))
@@ -187,7 +191,9 @@ def _ranging(sensor: Ranging, truth: Kinematics, seen: Observation) -> Float64[T
 
     Over the tags' positions this is a Laplacian with u uᵀ for weights, u the unit vector along a
     link; the tags' Jacobians take it to the poses. Which links pass through walls, how much too
-    long these make a range, and the clocks' errors count as known: no estimator knows more.
+    long these make a range, and the clocks' errors count as known: no estimator knows more. Where
+    obstacles are is not looked at: what passes through one counts as if it did not, which leaves
+    the bound below what it could be.
     """
     t = sensor.n_tags
     links, along, jacobian = range_links(sensor, truth, seen)
@@ -213,6 +219,8 @@ def range_links(
     if sensor.walls:
         blocked = depth(points.unsqueeze(2), points.unsqueeze(1), sensor.walls) > 0
         each[blocked] = range_information(replace(sensor.noise, nlos=1.0))
+    if sensor.sight.walls:
+        each = each * _through(sensor.noise, sensor.sight, points.unsqueeze(2), points.unsqueeze(1))
     if sensor.noise.per_metre:
         apart = points.unsqueeze(2) - points.unsqueeze(1)
         each = distance_information(sensor.noise, apart.norm(dim=-1))
@@ -272,6 +280,22 @@ def _mask(seen: Observation, name: str) -> Float64[Tensor, "B N F"]:
 
 def _points(seen: Observation, name: str, truth: Kinematics) -> Float64[Tensor, "B N L d"]:
     return seen[name].double().unflatten(-1, (-1, truth.position.shape[-1]))
+
+
+def _through(
+    noise: RangeNoise,
+    sight: Sight,
+    start: Float64[Tensor, "B *#s d"],
+    end: Float64[Tensor, "B *#s d"],
+) -> Float64[Tensor, "B *s"]:
+    """Share of a range's information that is left behind k walls, whose noise adds k s² to σ²; how
+    many walls there are counts as known."""
+    count = crossed(start, end, sight.walls)
+    share, clear = torch.ones_like(count, dtype=torch.float64), range_information(noise)
+    for k in range(1, int(count.max()) + 1):
+        std = (noise.std**2 + k * sight.std**2) ** 0.5
+        share[count == k] = range_information(replace(noise, std=std)) / clear
+    return share
 
 
 def _by_uav(slots: Float64[Tensor, "B N S k"], seen: Observation) -> Float64[Tensor, "B N N k"]:

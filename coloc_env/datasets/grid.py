@@ -168,6 +168,8 @@ def bridged(table: Table, held: float, mean: Floats) -> tuple[Table, Table]:
     where the mean stands and 0 elsewhere, in the same form."""
     most = round(held * 1e9)
     ends = np.flatnonzero(np.diff(table.time) > most)
+    if not len(ends):
+        return table, Table(table.time, np.zeros((len(table.time), 1)), ("missing",))
     time = np.insert(table.time, ends + 1, table.time[ends] + most)
     values = np.insert(table.values, ends + 1, mean, 0)
     missing = np.insert(np.zeros((len(table.time), 1)), ends + 1, 1.0, 0)
@@ -243,6 +245,9 @@ def slots_on(
 ) -> tuple[Floats, Flags]:
     """Measurements [T, D, count, F] by slot, D as deep as one step ever delivers the same slot,
     and which are there [T, D, count]."""
+    if not len(table.time):
+        shape = (grid.count, 1, count)
+        return np.zeros((*shape, table.values[:, columns].shape[1])), np.zeros(shape, dtype=bool)
     step = grid.step_of(table.time)
     inside = (step >= 0) & (step < grid.count)
     step, slot, values = step[inside], slot[inside], table.values[inside, columns]
@@ -268,6 +273,8 @@ def last_on(grid: Grid, table: Table) -> tuple[Floats, Flags]:
 
 def _widened(values: Floats, width: int) -> Floats:
     """[T, S, …] with S = ``width``, by zeros."""
+    if values.shape[1] == width:
+        return values
     return np.pad(values, ((0, 0), (0, width - values.shape[1]), *[(0, 0)] * (values.ndim - 2)))
 
 

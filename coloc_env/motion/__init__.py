@@ -14,6 +14,8 @@ from coloc_env.motion.curves import Circle, FigureEight, Helix
 from coloc_env.motion.followed import Followed
 from coloc_env.motion.formation import FormationChange
 from coloc_env.motion.groups import Groups
+from coloc_env.motion.gusts import GustOptions, Gusts
+from coloc_env.motion.inspection import Inspection
 from coloc_env.motion.kidnapped import KidnapOptions, Kidnapped
 from coloc_env.motion.lanes import Line, Square
 from coloc_env.motion.patrol import Patrol
@@ -42,6 +44,7 @@ MOTIONS: dict[str, Motion] = {
     "stop_and_go": StopAndGo(),
     "formation": FormationChange(),
     "random_velocity": RandomVelocity(),
+    "multi_scale": Inspection(),
 }
 MotionName = Annotated[str, OneOf(tuple(MOTIONS))]
 
@@ -58,7 +61,10 @@ __all__ = [
     "Followed",
     "FormationChange",
     "Groups",
+    "GustOptions",
+    "Gusts",
     "Helix",
+    "Inspection",
     "KidnapOptions",
     "Kidnapped",
     "Kinematics",

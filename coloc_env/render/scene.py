@@ -23,6 +23,7 @@ from coloc_env.render.snapshot import Snapshot
 from coloc_env.scenario import Scenario
 
 _PIECE = 12  # steps of a trail drawn in one tint
+_SIDES = 12  # of a column as it is drawn
 _SHARE = 1.06  # of the arena that the panel shows
 
 
@@ -93,6 +94,9 @@ class MapPanel:
             options: dict[str, Any] = {"facecolors": (*style.rgb(style.WALL), 0.28), "zorder": 3.0}
             shown = BOX_FACES if self._deep else BOX_FACES[1:2]
             self._polygons(list(box[shown]), edgecolors=style.WALL, linewidths=0.7, **options)
+        self._radius = scenario.sight.radius
+        self._columns = PolyCollection([], facecolors=style.WALL, alpha=0.35, zorder=3.1)
+        self._axes.add_collection(self._columns, autolim=False)
 
     def _grid(self) -> np.ndarray:
         """Lines [M, 2, 3] on the floor, ``spacing`` apart."""
@@ -193,6 +197,7 @@ class MapPanel:
         self._landmarks.set_offsets(view(snapshot.landmarks))
         self._anchors.set_offsets(view(snapshot.anchors))
         self._seen.set_offsets(view(snapshot.seen))
+        self._columns.set_verts([self._flat(f) for f in self._sides(snapshot.obstacles)])
         self._show_links(snapshot, alive_at)
         self._truth.set_segments(list(_pieces(view(history.truth))))
         self._guess.set_segments(list(_pieces(view(history.estimate))))
@@ -211,6 +216,22 @@ class MapPanel:
         for number, place, shown in zip(self._numbers, at, here, strict=False):
             number.set_visible(bool(shown))
             number.set_position(place)
+
+    def _sides(self, obstacles: np.ndarray) -> list[np.ndarray]:
+        """Faces of the columns about axes [C, d]: the sides, or in the plane the base."""
+        turn = np.linspace(0, 2 * np.pi, _SIDES + 1)
+        rim = self._radius * np.stack((np.cos(turn), np.sin(turn)), -1)
+        faces = []
+        for x, y, *_ in obstacles:
+            ring = rim + np.array((x, y))
+            low, high = (
+                np.column_stack((ring, np.full(len(rim), z))) for z in (self._low[2], self._high[2])
+            )
+            if not self._deep:
+                faces.append(low)
+                continue
+            faces += [np.stack((low[i], low[i + 1], high[i + 1], high[i])) for i in range(_SIDES)]
+        return faces
 
     def _show_links(self, snapshot: Snapshot, alive_at: np.ndarray) -> None:
         ends = self._view(alive_at)

@@ -21,6 +21,7 @@ class Snapshot:
     (m) are NaN before an estimate was made. ``links`` [M, 2] are pairs of UAVs one of
     which hears the other; ``landmarks`` [L, d] and ``anchors`` [A, d] lie on the team's map, and
     ``watching`` is the UAV that sees the points ``seen`` [K, d] among them (-1: all have failed).
+    ``obstacles`` [C, d] is where the axes of those that move are.
     """
 
     step: int
@@ -34,6 +35,7 @@ class Snapshot:
     anchors: np.ndarray
     seen: np.ndarray
     watching: int
+    obstacles: np.ndarray
 
     @property
     def close_links(self) -> bool:
@@ -82,6 +84,7 @@ def take(world: World, estimates: torch.Tensor | None) -> Snapshot:
         anchors=maps["anchor"],
         seen=_seen(leaves, maps, watching),
         watching=watching,
+        obstacles=world.obstacles[0].cpu().numpy(),
     )
 
 

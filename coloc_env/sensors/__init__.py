@@ -3,6 +3,7 @@
 from coloc_env.sensors.angles import AngleOptions, ArrivalAngles
 from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
+from coloc_env.sensors.compass import Compass, CompassOptions
 from coloc_env.sensors.displacement import Displacement
 from coloc_env.sensors.errors.clock import Clock
 from coloc_env.sensors.errors.range_noise import NlosKind, RangeNoise, RangeOptions
@@ -10,15 +11,21 @@ from coloc_env.sensors.height import BarometerOptions, Height
 from coloc_env.sensors.imu import GRAVITY, Imu, ImuOptions, RecordedImu, SimulatedImuOptions
 from coloc_env.sensors.ins import Ins, InsOptions
 from coloc_env.sensors.landmarks import LandmarkOptions, Landmarks
+from coloc_env.sensors.light import Light, LightOptions
+from coloc_env.sensors.magnetic import Magnetic, MagneticOptions
 from coloc_env.sensors.odometry import Odometry, RecordedOdometry
 from coloc_env.sensors.optical_flow import FlowOptions, OpticalFlow
 from coloc_env.sensors.position_fix import AnchorUavOptions, GnssOptions, PositionFix
 from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRangeOptions
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
+from coloc_env.sensors.rssi import Rssi, RssiOptions
+from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
+from coloc_env.sensors.ultrasonic import Ultrasonic, UltrasonicOptions
 from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
+from coloc_env.sensors.unmapped import MapOptions, UnmappedLandmarks
 
 __all__ = [
     "GRAVITY",
@@ -28,6 +35,8 @@ __all__ = [
     "ArrivalAngles",
     "BarometerOptions",
     "Clock",
+    "Compass",
+    "CompassOptions",
     "Displacement",
     "FlowOptions",
     "GnssOptions",
@@ -41,6 +50,11 @@ __all__ = [
     "Landmarks",
     "Layout",
     "Leaf",
+    "Light",
+    "LightOptions",
+    "Magnetic",
+    "MagneticOptions",
+    "MapOptions",
     "NlosKind",
     "Odometry",
     "OpticalFlow",
@@ -55,13 +69,20 @@ __all__ = [
     "Reference",
     "RelativePose",
     "RelativePoseOptions",
+    "Rssi",
+    "RssiOptions",
     "Sensor",
+    "Sight",
+    "SightOptions",
     "SimulatedImuOptions",
     "SlowFlight",
     "TagOptions",
     "Tdoa",
     "UavBearings",
     "UavRangeOptions",
+    "Ultrasonic",
+    "UltrasonicOptions",
     "UnlabelledLandmarks",
+    "UnmappedLandmarks",
     "Window",
 ]

@@ -1,8 +1,9 @@
 """Landmarks at known positions, seen as relative position vectors in the body frame."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -16,13 +17,16 @@ from coloc_env.options import (
     Metres,
     PositiveMetres,
     PositiveSeconds,
+    Quantity,
     Seconds,
     Share,
 )
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, usable
 from coloc_env.sensors.errors.persistence import held_uniform
+from coloc_env.sensors.sight import Sight
 from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
 
+FieldOfView = Annotated[float, Quantity("rad", above=0.0, most=2 * math.pi)]
 Placement = Literal["random", "symmetric"]
 Association = Literal["known", "unknown"]
 
@@ -43,10 +47,12 @@ class Landmarks(Sensor):
     ``radius``; landmarks are drawn uniformly in the arena for every world unless ``positions``
     gives them; with ``placement="symmetric"`` every second one is where half a turn about the
     arena's vertical axis takes the one before, and the last of an odd number on that axis.
-    ``false_matches``: fraction of measurements that belong to another landmark, for every step
-    anew, or, with ``alias_time``, to the same one for that long (s; a Markov chain whose
+    ``false_matches``: fraction of measurements that belong to another landmark, drawn in every
+    step, or, with ``alias_time``, to the same one for that long (s; a Markov chain whose
     correlation falls by e in that time); ``dropout``: fraction that is missing; ``off``: times
-    (from, to) in s without any.
+    (from, to) in s without any. ``field_of_view``: full opening angle (rad) of the cone about the
+    body's x axis in which they are seen (None: all around; in the plane a sector). ``sight``: what
+    hides them.
     """
 
     count: int = 20
@@ -56,6 +62,8 @@ class Landmarks(Sensor):
     dropout: float = 0.0
     off: tuple[float, float] | None = None
     positions: tuple[tuple[float, ...], ...] | None = None
+    field_of_view: float | None = None
+    sight: Sight = field(default_factory=Sight)
     alias_time: float | None = None
     placement: Placement = "random"
 
@@ -77,6 +85,8 @@ class Landmarks(Sensor):
             "off",
             "(from, to) in s, from ≤ to",
         )
+        angle = self.field_of_view is None or 0 < self.field_of_view <= 2 * math.pi
+        require(angle, self, "field_of_view", "an opening angle in rad, above 0 and up to 2π")
 
     @property
     def fix_slots(self) -> int:
@@ -127,7 +137,14 @@ class Landmarks(Sensor):
         # Straight to float32: a comparison into a mask of bools takes twice as long.
         reach = torch.full_like(window.alive, -1.0, dtype=torch.float32)
         reach = reach.masked_fill(window.alive, self.radius**2).unsqueeze(-1)
+        rotation = rotation_matrix(motion.attitude.to(torch.float32))
+        if self.field_of_view is not None:
+            reach = torch.where(self._ahead(rotation, apart, squared), reach, -1.0)
         visible = torch.le(squared, reach, out=squared)
+        if not self.sight.clear:
+            ends = motion.position.unsqueeze(-2), placed["positions"][:, None, None]
+            hidden = self.sight.between(window, *ends) > 0
+            visible.masked_fill_(hidden, 0.0)
         if self.false_matches:
             wrong, other = self._mistaken(window)
             index = torch.arange(self.count, device=keys.device)
@@ -141,7 +158,6 @@ class Landmarks(Sensor):
             time = window.steps * window.layout.arena.dt
             blind = (time >= self.off[0]) & (time < self.off[1])
             visible.masked_fill_(blind[..., None, None], 0.0)
-        rotation = rotation_matrix(motion.attitude.to(torch.float32))
         seen = noise.normal(keys, "landmarks", n * self.count * dim)
         seen = seen.unflatten(-1, (n, self.count, dim)).mul_(self.std)
         for column in range(dim):
@@ -150,6 +166,19 @@ class Landmarks(Sensor):
                 value.addcmul_(rotation[..., row, column, None], apart[row])
             seen[..., column].add_(value).mul_(visible)
         return {"landmarks": seen.flatten(-2), "landmark_mask": visible}
+
+    def _ahead(
+        self,
+        rotation: Float32[Tensor, "R K N d d"],
+        apart: list[Float32[Tensor, "R K N L"]],
+        squared: Float32[Tensor, "R K N L"],
+    ) -> Bool[Tensor, "R K N L"]:
+        """Which landmarks lie in the field of view: z₁ ≥ ‖z‖ cos(φ / 2), z = Rᵀ(L − p)."""
+        assert self.field_of_view is not None
+        forward = rotation[..., 0, 0, None] * apart[0]
+        for row in range(1, len(apart)):
+            forward.addcmul_(rotation[..., row, 0, None], apart[row])
+        return forward >= math.cos(0.5 * self.field_of_view) * squared.sqrt()
 
     def _mistaken(
         self, window: Window
@@ -189,7 +218,8 @@ class LandmarkOptions(Group):
     With ``association=unknown`` nothing says which landmark a vector is to. A share
     ``false_matches`` of these belongs to another landmark, in each step by chance or the same one
     over ``alias_time`` s, a share ``landmark_dropout`` is missing, and in the times ``range_only``
-    (from, to) none is seen. The team believes the Gaussian part alone.
+    (from, to) none is seen. ``landmark_field``: full opening angle of the cone about the body's x
+    axis in which they are seen (none: all around). The team believes the Gaussian part alone.
     """
 
     title: ClassVar[str] = "landmarks"
@@ -200,16 +230,23 @@ class LandmarkOptions(Group):
     false_matches: Share = 0.0
     landmark_dropout: Share = 0.0
     range_only: tuple[Seconds, Seconds] | None = None
+    landmark_field: FieldOfView | None = None
     association: Association = "known"
     alias_time: PositiveSeconds | None = None
     landmark_placement: Placement = "random"
 
     @property
     def true(self) -> tuple[Landmarks, ...]:
-        """The sensor as it is, by landmarks with names."""
+        """The sensor as it is, by landmarks with names and with nothing in the way."""
         wrong = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
-        lasting, where = self.alias_time, self.landmark_placement
-        return tuple(replace(one, alias_time=lasting, placement=where) for one in wrong)
+        ahead, lasting, where = self.landmark_field, self.alias_time, self.landmark_placement
+        return tuple(
+            replace(one, field_of_view=ahead, alias_time=lasting, placement=where) for one in wrong
+        )
+
+    def behind(self, sight: Sight) -> tuple[Landmarks, ...]:
+        """The sensor as it is, with what hides landmarks."""
+        return tuple(replace(one, sight=sight) for one in self.true)
 
     @property
     def believed(self) -> tuple[Landmarks, ...]:

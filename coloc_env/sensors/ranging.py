@@ -25,6 +25,7 @@ from coloc_env.sensors.base import (
 )
 from coloc_env.sensors.errors.clock import Clock
 from coloc_env.sensors.errors.range_noise import RangeNoise, RangeOptions
+from coloc_env.sensors.sight import Sight
 
 Tags = tuple[tuple[tuple[float, ...], ...], ...]
 
@@ -62,7 +63,7 @@ class Ranging(Sensor):
     same number, drawn once per pair, tags and step. ``latency``: steps between ranging and
     delivery. ``walls``: solid boxes; a range that comes through one (if it does: see ``Network``)
     has the noise's NLOS bias and is too long by ``excess`` times the metres inside. ``clock``: the
-    systematic errors of each pair (None: none).
+    systematic errors of each pair (None: none). ``sight``: what else is in the way.
     """
 
     between_uavs = True
@@ -73,6 +74,7 @@ class Ranging(Sensor):
     walls: tuple[Box, ...] = ()
     excess: float = 0.0
     clock: Clock | None = None
+    sight: Sight = field(default_factory=Sight)
 
     def __post_init__(self) -> None:
         require(self.latency >= 0, self, "latency", "a number of steps ≥ 0")
@@ -111,10 +113,11 @@ class Ranging(Sensor):
             return x.gather(2, among.flatten(2)).view(distance.shape)
 
         obstructed = by_pair(self.noise.obstructed(window, pairs, "ranging", self.latency))
+        out = by_pair(self.noise.out(window, pairs, "ranging", self.latency))
         bias = by_pair(self.noise.biases(window, pairs, "ranging", self.latency))
-        blocked = None
+        blocked, through = None, None
+        own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
         if self.walls:
-            own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
             inside = depth(own, theirs, self.walls).to(torch.float32)
             blocked = inside > 0
         ranges, lost = self.noise.sample(distance, link, "ranging", blocked, obstructed)
@@ -125,11 +128,15 @@ class Ranging(Sensor):
         if self.clock is not None:
             late = self.clock.errors(window, window.steps - self.latency, placed)
             ranges.add_(late[..., None, None])
+        if not self.sight.clear:
+            through = self.sight.between(window, own, theirs, self.latency)
+            ranges.add_(self.sight.lateness(through, link, "ranging"))
         mask = window.reach[..., None, None].expand(ranges.shape)
         if self.latency:
             mask = mask & (window.steps >= self.latency)[..., None, None, None, None]
-        if lost is not None:
-            mask = mask & ~lost
+        for missing in (lost, out, self.sight.lost(through)):
+            if missing is not None:
+                mask = mask & ~missing
         mask = mask.to(torch.float32)
         return {"ranges": (ranges * mask).flatten(-3), "range_mask": mask.flatten(-3)}
 
@@ -166,7 +173,7 @@ class AnchorRanging(Sensor):
 
     Entry ``a · A + m`` is between the UAV's own tag ``a`` and anchor ``m``, within ``radius`` m.
     ``blocked``: indices of anchors behind an obstacle, whose ranges all carry the noise's NLOS
-    bias. ``walls``: solid boxes that no range passes.
+    bias. ``walls``: solid boxes that no range passes; ``sight``: what else is in the way.
     """
 
     anchors: tuple[tuple[float, ...], ...]
@@ -175,6 +182,7 @@ class AnchorRanging(Sensor):
     radius: float | None = None
     blocked: tuple[int, ...] = ()
     walls: tuple[Box, ...] = ()
+    sight: Sight = field(default_factory=Sight)
 
     def __post_init__(self) -> None:
         require(len(self.anchors) > 0, self, "anchors", "at least one anchor position")
@@ -219,6 +227,12 @@ class AnchorRanging(Sensor):
         bias = self.noise.biases(window, index, "anchor_ranging")
         if bias is not None:
             ranges = ranges.add_(bias)
+        out, through = self.noise.out(window, index, "anchor_ranging"), None
+        if not self.sight.clear:
+            through = self.sight.between(
+                window, tags.unsqueeze(-2), placed["anchors"][:, None, None, None]
+            )
+            ranges = ranges.add_(self.sight.lateness(through, link, "anchor_ranging"))
         mask = window.alive[..., None, None].expand(ranges.shape)
         if window.to_anchors is not None:
             mask = mask & window.to_anchors(placed["anchors"])[:, None, :, None]
@@ -229,7 +243,8 @@ class AnchorRanging(Sensor):
         if self.walls:
             own = tags.unsqueeze(-2).expand_as(apart)
             mask = mask & (depth(own, own - apart, self.walls) == 0)
-        if lost is not None:
-            mask = mask & ~lost
+        for missing in (lost, out, self.sight.lost(through)):
+            if missing is not None:
+                mask = mask & ~missing
         mask = mask.to(torch.float32)
         return {"anchor_ranges": (ranges * mask).flatten(-2), "anchor_range_mask": mask.flatten(-2)}

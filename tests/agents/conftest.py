@@ -84,6 +84,7 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "sight_bias": indoor(uwb=False, imu_bias=True, n_uavs=20),
     "unnamed": indoor(association="unknown"),
     "any_yaw": indoor(prior_yaw="uniform"),
+    "unmapped": indoor(landmarks=6, landmarks_known=False, anchors=4, n_uavs=3),
     "plane": plane,
     "tags": tags,
     "wsn": lambda: make_scenario("wsn-v0", n_uavs=3, uwb_dropout=0.2),
@@ -124,6 +125,9 @@ CHOSEN = {
     "ekf_trust": ("default", "plane", "tags"),
     "pf500": ("default", "anchors", "plane"),
     **dict.fromkeys(("pfnn", "pf_trust"), ("default", "plane")),
+    "pf_auxiliary": ("default", "anchors"),
+    "pf_mixture": ("default", "uniform", "plane"),
+    "pf_rao_blackwell": ("default", "imu_bias", "anchors", "plane", "tags"),
     "mappo": ("default", "slots", "plane"),
     **dict.fromkeys(("pf", "pf800", "ippo", "sb3-ppo"), ("default",)),
     "dfgo": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
@@ -143,10 +147,22 @@ CHOSEN = {
     "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
+    "slam": ("unmapped",),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
-SPECIAL = ("unnamed", "any_yaw", "wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
-SPECIAL = (*SPECIAL, "late", "biased", "sight", "sight_few", "sight_uniform", "sight_bias")
+SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
+SPECIAL = (
+    *SPECIAL,
+    "unmapped",
+    "unnamed",
+    "any_yaw",
+    "late",
+    "biased",
+    "sight",
+    "sight_few",
+    "sight_uniform",
+    "sight_bias",
+)
 ELSEWHERE = [f for f in FAMILIES if f not in SPECIAL]
 CASES = [
     *((n, f) for n in LOCALIZERS for f in CHOSEN.get(n, ELSEWHERE)),
@@ -162,6 +178,7 @@ CASES = [
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *(("stdcl:variant=calibrated", f) for f in ("swarm", "campus")),
+    *((f"slam:maps={m}", "unmapped") for m in ("own", "shared")),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
 ]
 CASES = [case for case in CASES if case not in REFUSED]
@@ -222,6 +239,8 @@ def room(name: str, **overrides: Any) -> Scenario:
         return make_scenario("stein2d-v0", **overrides)
     if name in ("stdcl", "stgat"):
         return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
+    if "unmapped" in chosen:
+        return make_scenario("indoor-v0", landmarks_known=False, **overrides)
     if "sight" in chosen:
         return make_scenario("indoor-v0", uwb=False, **overrides)
     among: dict[str, Any] = {} if "default" in chosen else {"anchors": 8, "landmarks": 0}

@@ -138,7 +138,7 @@ def test_walls_by_hand() -> None:
 def test_walls_block_ranges_messages_and_links() -> None:
     """Two UAVs on opposite sides of a circle about a pillar never hear each other."""
     pillar = (14.0, 9.0, 0.0, 16.0, 11.0, 5.0)
-    world = World(make_scenario("indoor-v0", n_uavs=4, walls=pillar), 1)
+    world = World(make_scenario("indoor-v0", n_uavs=4, walls=pillar, wall_delay=math.inf), 1)
     observation = world.reset(0)
     for k in range(30):
         for name in ("links", "range_mask") + (("message_mask",) if k else ()):

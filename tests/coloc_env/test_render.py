@@ -39,7 +39,7 @@ def simulated(steps, **overrides):
         ({}, 25),
         ({"n_uavs": 1}, 25),
         ({"n_uavs": 40, "max_neighbours": 8}, 3),
-        ({"walls": (10.0, 5.0, 0.0, 12.0, 15.0, 5.0)}, 3),
+        ({"walls": (10.0, 5.0, 0.0, 12.0, 15.0, 5.0), "obstacles": 2}, 3),
         ({"anchors": 4}, 3),
         ({"failure_rate": 1.0, "horizon": 30}, 25),
         ({"landmarks": 0}, 0),

@@ -9,6 +9,7 @@ from typing import Any, cast
 from agents import LOCALIZERS, make
 from agents.factor_graph.pose_graph import PoseGraph
 from agents.particle.hybrid import HybridFilter
+from agents.slam.slam import Slam
 from agents.stdcl.loop import NetworkLoop
 from agents.stein.stein_vi import SteinViFilter
 from agents.stein.team import RelativeTeam
@@ -90,4 +91,6 @@ def _at_home(name: str) -> Iterator[Task]:
         overrides: tuple[tuple[str, Any], ...] = (("anchors", anchors),)
         if issubclass(kind, SteinViFilter):  # it refuses a team with ranges
             overrides = (*overrides, ("uwb", False))
+        if issubclass(kind, Slam):  # it refuses a team with a map
+            overrides = (*overrides, ("landmarks_known", False))
         yield Task("agents", name, name, "indoor-v0", overrides)

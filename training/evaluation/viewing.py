@@ -1,10 +1,11 @@
 """Recordings for rerun's viewer: a localizer's run as it goes, or the first run of an evaluation.
 
 Entities, with an instance a UAV in order: ``world/truth``, ``world/AGENT/estimate``,
-``world/AGENT/ellipsoid``, ``world/AGENT/particles``; ``world/links`` and ``world/ranges``; what
-stands still: ``world/arena``, ``world/walls``, ``world/landmarks``, ``world/anchors``. Scalars,
-with a series a UAV: ``error/AGENT`` (m), ``nees/AGENT``; ``radio/bytes`` of all. Timelines:
-``time`` (s) and ``step``. Lengths in m, world frame, z = 0 in the plane.
+``world/AGENT/ellipsoid``, ``world/AGENT/particles``; ``world/links`` and ``world/ranges``;
+``world/obstacles``; what stands still: ``world/arena``, ``world/walls``, ``world/landmarks``,
+``world/anchors``. Scalars, with a series a UAV: ``error/AGENT`` (m), ``nees/AGENT``;
+``radio/bytes`` of all. Timelines: ``time`` (s) and ``step``. Lengths in m, world frame, z = 0 in
+the plane.
 """
 
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from agents.localizer import Localizer
+from coloc_env.motion import Arena
 from coloc_env.render.style import uav_colours
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import Ranging
@@ -71,6 +73,17 @@ class Viewing:
         if boxes:
             low, high = (in_space(np.array([box[i] for box in boxes], float)) for i in (0, 1))
             self.log("world/walls", self.rr.Boxes3D(mins=low, sizes=high - low), static=True)
+
+    def obstacles(self, axes: Floats, radius: float, arena: Arena) -> None:
+        """Columns [C, d] that move, as boxes from the floor to the ceiling."""
+        if len(axes):
+            low, high = (
+                in_space(np.array([side], float))[0, 2] for side in (arena.low, arena.high)
+            )
+            centres = in_space(axes)
+            centres[:, 2] = 0.5 * (low + high)
+            halves = np.tile((radius, radius, 0.5 * (high - low)), (len(axes), 1))
+            self.log("world/obstacles", self.rr.Boxes3D(centers=centres, half_sizes=halves))
 
     def truth(self, position: Floats, radius: float) -> None:
         """Where UAVs are [N, d]."""
@@ -135,6 +148,7 @@ def view_scenario(
             view.arena(arena.low, arena.high, places_of(step.world))
             view.walls(scenario.network.walls)
         view.at(step.k, arena.dt)
+        view.obstacles(step.world.obstacles[0].numpy(), scenario.sight.radius, arena)
         _log_step(view, localizer.name, step, radius)
         progress(step.k + 1)
     view.close()

@@ -14,9 +14,14 @@ from agents.models.measurements.base import (
     received,
 )
 from agents.models.measurements.bearings import LandmarkRangeBearings, UavRangeBearings
+from agents.models.measurements.compass import Headings
 from agents.models.measurements.differences import RangeDifferences
 from agents.models.measurements.flow import BodyVelocities
+from agents.models.measurements.light import Lamps
+from agents.models.measurements.magnetic import MappedFields
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
+from agents.models.measurements.rssi import SignalStrengths
+from agents.models.measurements.ultrasonic import WallDistances
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
 from agents.registry import NotServed
 from coloc_env.scenario import (
@@ -29,16 +34,21 @@ from coloc_env.scenario import (
 from coloc_env.sensors import (
     AnchorRanging,
     ArrivalAngles,
+    Compass,
     Height,
     LandmarkBearings,
     Landmarks,
+    Light,
+    Magnetic,
     OpticalFlow,
     PositionFix,
     Ranging,
+    Rssi,
     Sensor,
     SlowFlight,
     Tdoa,
     UavBearings,
+    Ultrasonic,
     UnlabelledLandmarks,
 )
 from coloc_env.sensors.base import usable
@@ -48,17 +58,22 @@ __all__ = [
     "AnchorRanges",
     "Block",
     "BodyVelocities",
+    "Headings",
     "Heights",
+    "Lamps",
     "LandmarkRangeBearings",
     "LandmarkVectors",
+    "MappedFields",
     "Measurement",
     "Neighbours",
     "PositionFixes",
     "RangeDifferences",
+    "SignalStrengths",
     "Slowness",
     "UavAngles",
     "UavRangeBearings",
     "UavRanges",
+    "WallDistances",
     "make_measurements",
     "measures",
     "model_of",
@@ -74,24 +89,25 @@ _M = TypeVar("_M", bound=Callable[[Any], Measurement])
 MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     AnchorRanging: AnchorRanges,
     ArrivalAngles: UavAngles,
+    Compass: Headings,
     Height: Heights,
     LandmarkBearings: LandmarkRangeBearings,
     Landmarks: LandmarkVectors,
+    Light: Lamps,
+    Magnetic: MappedFields,
     OpticalFlow: BodyVelocities,
     PositionFix: PositionFixes,
     Ranging: UavRanges,
+    Rssi: SignalStrengths,
     SlowFlight: Slowness,
     Tdoa: RangeDifferences,
     UavBearings: UavRangeBearings,
+    Ultrasonic: WallDistances,
     UnlabelledLandmarks: LandmarkVectors,
 }
 _BODY_FRAME = (
-    ArrivalAngles,
-    Landmarks,
-    LandmarkBearings,
-    OpticalFlow,
-    UavBearings,
-    UnlabelledLandmarks,
+    *(ArrivalAngles, Compass, Landmarks, LandmarkBearings, Light, Magnetic, OpticalFlow),
+    *(UavBearings, Ultrasonic, UnlabelledLandmarks),
 )
 
 

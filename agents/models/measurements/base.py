@@ -64,7 +64,10 @@ class Block:
     Where the measurements involve the UAVs in neighbour slots, ``partner`` is ∂h/∂p of that UAV's
     position and ``partner_variance`` what its uncertainty adds; they come as (…, slot,
     ``per_slot``) flattened, and ``mutual``: both UAVs hold the very same number.
-    ``distance`` (m) is that to the other UAV where it is what was measured.
+    ``distance`` (m) is that to the other UAV where it is what was measured. ``curvature``: the size
+    (Frobenius norm) of ∂²h/∂p², per m², of what is far from linear while positions are broad.
+    ``stray``: the density of measurements that show something else, over that at the peak.
+    ``varies``: the variance depends on the state, so that a likelihood counts its logarithm.
     """
 
     residual: Float[Tensor, "B N m k"]
@@ -76,6 +79,9 @@ class Block:
     per_slot: int = 1
     mutual: bool = False
     distance: Float[Tensor, "B N m 1"] | None = None
+    curvature: Float[Tensor, "B N m k"] | None = None
+    varies: bool = False
+    stray: float = 0.0
 
     @property
     def total_variance(self) -> Float[Tensor, "B N m k"]:
@@ -83,6 +89,14 @@ class Block:
         if self.partner_variance is None:
             return self.variance
         return self.variance + self.partner_variance
+
+    def curved(self, position: Float[Tensor, "B N d d"]) -> "Block":
+        """With what linearizing neglects as noise: the variance of ½ δᵀ M δ, ½ tr((M P)²), for the
+        covariance ``position`` P of δ as if it were round (Jazwinski 1970, section 9.3)."""
+        if self.curvature is None:
+            return self
+        mean = position.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        return replace(self, variance=self.variance + 0.5 * (self.curvature * mean) ** 2)
 
     def bent(self, apart: Float[Tensor, "B N S d d"], steps: float) -> "Block":
         """With what linearizing distances neglects as noise: their variance grows by

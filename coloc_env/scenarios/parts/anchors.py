@@ -3,8 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from coloc_env.motion import Box
 from coloc_env.options import Count, Group, Metres, PositiveMetres, Share
-from coloc_env.sensors import AnchorRanging, RangeNoise, Tdoa
+from coloc_env.sensors import AnchorRanging, RangeNoise, Rssi, RssiOptions, Tdoa
 from coloc_env.sensors.ranging import Tags
 
 _SPOTS = (
@@ -73,6 +74,16 @@ class TdoaOptions(Group):
         places = anchor_places("tdoa_anchors", self.tdoa_anchors, room)
         lost, near = self.tdoa_dropout, self.tdoa_radius
         return (Tdoa(places, self.tdoa_std, tags, dropout=lost, radius=near),)
+
+
+def access_points(
+    options: RssiOptions, room: tuple[float, ...], walls: tuple[Box, ...]
+) -> tuple[Rssi, ...]:
+    """The signal strengths that options ask for, in a room with sides in m with walls in it."""
+    if not options.rssi:
+        return ()
+    places = anchor_places("access_points", options.access_points, room)
+    return (options.true(places, walls),)
 
 
 def anchor_places(

@@ -9,11 +9,12 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.options import Group, Metres, PositiveMetres, PositiveSeconds, Share
+from coloc_env.options import Group, Metres, PositiveMetres, PositiveSeconds, Seconds, Share
 from coloc_env.sensors.base import Window, require
 from coloc_env.sensors.errors.persistence import gauss_markov, held_uniform
 
 NlosKind = Literal["exponential", "constant"]
+OutageOf = Literal["link", "team"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,11 @@ class RangeNoise:
     - ``dropout``: probability that no range arrives;
     - ``per_metre``: what each metre of distance adds to ``std``, in m;
     - ``bias_std``: standard deviation in m of each link's bias, a Gauss–Markov process whose
-      correlation falls by e in ``bias_time`` s.
+      correlation falls by e in ``bias_time`` s;
+    - ``outage``: share of the time in which no range arrives, ``outage_time`` s at a stretch (a
+      state, out or not, is redrawn at a mean interval of so long), of each link for itself
+      (``outage_of="link"``) or of all links at once (``"team"``); and none in the times ``off``
+      (from, to) in s.
     """
 
     std: float = 0.2
@@ -49,9 +54,13 @@ class RangeNoise:
     per_metre: float = 0.0
     bias_std: float = 0.0
     bias_time: float = 100.0
+    outage: float = 0.0
+    outage_time: float = 5.0
+    outage_of: OutageOf = "link"
+    off: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("nlos", "tail", "impulse", "dropout"):
+        for name in ("nlos", "tail", "impulse", "dropout", "outage"):
             require(0 <= getattr(self, name) <= 1, self, name, "a probability in [0, 1]")
         sizes = ("std", "nlos_bias", "tail_std", "uniform", "impulse_size", "per_metre", "bias_std")
         for name in sizes:
@@ -61,6 +70,37 @@ class RangeNoise:
         require(self.nlos_kind in kinds, self, "nlos_kind", f"one of {', '.join(kinds)}")
         lasting = self.nlos_time is None or 0 < self.nlos_time < math.inf
         require(lasting, self, "nlos_time", "a time in s > 0")
+        require(0 < self.outage_time < math.inf, self, "outage_time", "a time in s > 0")
+        of = get_args(OutageOf)
+        require(self.outage_of in of, self, "outage_of", f"one of {', '.join(of)}")
+        ordered = self.off is None or self.off[0] <= self.off[1]
+        require(ordered, self, "off", "(from, to) in s, from ≤ to")
+
+    def out(
+        self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
+    ) -> Bool[Tensor, "R K *l"] | None:
+        """Which of the numbered links are in an outage, ``latency`` steps before each of the
+        window's; None where none ever is. One of the team is the same for ranges of all kinds."""
+        if not self.outage and self.off is None:
+            return None
+        dt, found = window.layout.arena.dt, None
+        steps = window.steps - latency
+        if self.outage:
+            whose, name = links, f"{stream}.outage"
+            if self.outage_of == "team":
+                whose, name = torch.zeros_like(links.flatten()[:1]), "uwb.outage"
+            time = self.outage_time / dt
+            drawn = held_uniform(window.rows, steps[:, 0], steps.shape[1], whose, name, time)
+            found = drawn < self.outage
+            if self.outage_of == "team":
+                found = found.view(*steps.shape, *(1,) * links.dim())
+            found = found.expand(*steps.shape, *links.shape)
+        if self.off is not None:
+            now = steps * dt
+            none = (now >= self.off[0]) & (now < self.off[1])
+            none = none.view(*steps.shape, *(1,) * links.dim()).expand(*steps.shape, *links.shape)
+            found = none if found is None else found | none
+        return found
 
     def obstructed(
         self, window: Window, links: Int64[Tensor, "*l"], stream: str, latency: int = 0
@@ -137,9 +177,11 @@ class RangeOptions(Group):
     step by chance or over ``nlos_time`` s; a share ``uwb_tail`` has noise of ``uwb_tail_std`` m
     instead; ``uwb_uniform`` m is the half width of a uniform error; a share ``uwb_impulse`` is off
     by up to ``uwb_impulse_size`` m, and a share ``uwb_dropout`` is missing. Each link's ranges have
-    a bias of ``range_bias_std`` m that lasts ``range_bias_time`` s (a Gauss–Markov process). The
-    team believes the Gaussian parts alone, with ``believed_uwb_std`` m for ``uwb_std`` (none: the
-    true one, where the scenario does not say otherwise).
+    a bias of ``range_bias_std`` m that lasts ``range_bias_time`` s (a Gauss–Markov process). There
+    are none for a share ``uwb_outage`` of the time, ``uwb_outage_time`` s at a stretch, of each
+    ``link`` for itself or of the whole ``team`` (``uwb_outage_of``), and none in the times
+    ``uwb_off`` (from, to). The team believes the Gaussian parts alone, with ``believed_uwb_std`` m
+    for ``uwb_std`` (none: the true one, where the scenario does not say otherwise).
     """
 
     title: ClassVar[str] = "UWB ranges"
@@ -158,6 +200,10 @@ class RangeOptions(Group):
     uwb_dropout: Share = 0.0
     range_bias_std: Metres = 0.0
     range_bias_time: PositiveSeconds = 100.0
+    uwb_outage: Share = 0.0
+    uwb_outage_time: PositiveSeconds = 5.0
+    uwb_outage_of: OutageOf = "link"
+    uwb_off: tuple[Seconds, Seconds] | None = None
     believed_uwb_std: PositiveMetres | None = None
 
     @property
@@ -178,6 +224,10 @@ class RangeOptions(Group):
             dropout=self.uwb_dropout,
             bias_std=self.range_bias_std,
             bias_time=self.range_bias_time,
+            outage=self.uwb_outage,
+            outage_time=self.uwb_outage_time,
+            outage_of=self.uwb_outage_of,
+            off=self.uwb_off,
         )
 
     @property

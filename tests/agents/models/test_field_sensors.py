@@ -40,10 +40,21 @@ def flow(p: np.ndarray, v: np.ndarray, q: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(np.roll(q, -1)).inv().apply(v)[:2]
 
 
+def compass(p: np.ndarray, v: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(np.roll(q, -1)).as_euler("ZYX")[:1]
+
+
+def strengths(p: np.ndarray, v: np.ndarray, q: np.ndarray) -> np.ndarray:
+    points = np.array(make_scenario("indoor-v0", rssi=True).sensors[-1].points)
+    return -40 - 22 * np.log10(np.linalg.norm(p - points, axis=-1))
+
+
 LIKELIHOODS: dict[str, tuple[dict[str, Any], str, Predict, Any]] = {
     "tdoa": ({"tdoa_anchors": 4, "tags": 2, "tag_arm": 0.3}, "tdoa", tdoa, 0.15),
     "gnss": ({"gnss": True}, "position_fix", fix, np.array((1.0, 1.0, 2.0))),
     "flow": ({"flow": True, "flow_std": 0.3}, "flow", flow, 0.3),
+    "compass": ({"compass": True}, "compass", compass, 0.1),
+    "signal strength": ({"rssi": True, "rssi_std": 0.3}, "rssi", strengths, 0.3),
 }
 
 

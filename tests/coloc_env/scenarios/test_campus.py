@@ -392,7 +392,7 @@ def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> Non
 
 
 def test_walls_that_let_signals_through_need_a_radius() -> None:
-    with pytest.raises(ValueError, match=r"wall_loss=3\.0 is not allowed: infinite, unless"):
+    with pytest.raises(ValueError, match=r"wall_loss=3\.0 is not allowed: 0 or infinite, unless"):
         Network(wall_loss=3.0)
 
 

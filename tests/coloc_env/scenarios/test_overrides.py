@@ -26,6 +26,10 @@ RANGES: dict[str, Any] = {
     "uwb_dropout": 0.5,
     "range_bias_std": 0.5,
     "range_bias_time": 3.0,
+    "uwb_outage": 0.5,
+    "uwb_outage_time": 0.2,
+    "uwb_outage_of": "team",
+    "uwb_off": (0.0, 0.2),
 }
 DELAYED = {**RANGES, "uwb_delay": 1}
 LANDMARKS: dict[str, Any] = {
@@ -38,6 +42,7 @@ LANDMARKS: dict[str, Any] = {
     "association": "unknown",
     "alias_time": 3.0,
     "landmark_placement": "symmetric",
+    "landmark_field": 1.0,
 }
 INS: dict[str, Any] = {"ins_std": 1.0, "ins_bias": 1.0, "ins_bias_time": 5.0}
 PRIOR: dict[str, Any] = {"prior": "uniform", "prior_std": 9.0, "max_speed": 2.0}
@@ -89,7 +94,39 @@ CARRIED: dict[str, Any] = {
     "barometer_drift": 2.0,
     "barometer_time": 5.0,
     "barometer_dropout": 0.5,
+    "compass": True,
+    "compass_std": 0.5,
+    "compass_dropout": 0.5,
+    "light": True,
+    "lamps": 3,
+    "lamp_power": 500.0,
+    "light_ambient": 5.0,
+    "light_share": 0.2,
+    "light_floor": 9.0,
+    "light_angle_std": 0.2,
+    "light_radius": 5.0,
+    "rssi": True,
+    "access_points": 3,
+    "rssi_std": 9.0,
+    "rssi_power": -30.0,
+    "rssi_exponent": 3.0,
+    "rssi_wall_loss": 9.0,
+    "rssi_dropout": 0.5,
+    "ultrasonic": True,
+    "ultrasonic_std": 0.5,
+    "ultrasonic_reach": 2.0,
+    "ultrasonic_dropout": 0.6,
+    "magnetic": True,
+    "magnetic_std": 2.0,
+    "anomaly_std": 9.0,
+    "anomaly_length": 3.0,
+    "magnetic_map_std": 2.0,
+    "magnetic_map_time": 2.0,
+    "building": 3,
+    "magnetic_dropout": 0.5,
 }
+IN_THE_WAY = (11.0, 9.0, 0.0, 11.5, 11.0, 5.0)
+PILLAR = (14.0, 9.0, 0.0, 16.0, 11.0, 5.0)
 STEIN: dict[str, Any] = {
     "horizon": 17,
     "dt": 0.2,
@@ -120,7 +157,15 @@ CHANGED: dict[str, dict[str, Any]] = {
         "gyro_bias": 0.9,
         "believed_imu_bias": True,
         "max_neighbours": 2,
-        "walls": (14.0, 9.0, 0.0, 16.0, 11.0, 5.0),
+        "landmarks_known": False,
+        "walls": PILLAR,
+        "wall_delay": 2.0,
+        "wall_std": 0.9,
+        "obstacles": 9,
+        "obstacle_radius": 2.0,
+        "obstacle_speed": 3.0,
+        "gust_std": 0.5,
+        "gust_time": 3.0,
         **CARRIED,
         **TEAM,
         **LANDMARKS,
@@ -195,6 +240,8 @@ RANGES_WITH: dict[str, dict[str, Any]] = {
     "nlos_time": {"nlos": 0.5},
     "uwb_tail_std": {"uwb_tail": 0.5},
     "uwb_impulse_size": {"uwb_impulse": 0.5},
+    "uwb_outage_time": {"uwb_outage": 0.5},
+    "uwb_outage_of": {"uwb_outage": 0.5},
 }
 FAILING: dict[str, dict[str, Any]] = {"failure_rate": {"horizon": 4}}
 STEERED: dict[str, dict[str, Any]] = {
@@ -212,6 +259,11 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **UNIFORM,
         **STEERED,
         "v_max": {"control": "velocity"},
+        "wall_delay": {"walls": PILLAR},
+        "wall_std": {"walls": PILLAR},
+        "obstacle_radius": {"obstacles": 9},
+        "obstacle_speed": {"obstacles": 9},
+        "gust_time": {"gust_std": 0.5},
         "nlos_anchor": {"anchors": 2},
         "alias_time": {"false_matches": 0.5},
         "kidnapped": {"kidnap_at": 0.2},
@@ -223,6 +275,16 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"gnss": True} for name in CARRIED if name.startswith("gnss_")},
         **{name: {"flow": True} for name in CARRIED if name.startswith("flow_")},
         **{name: {"barometer": True} for name in CARRIED if name.startswith("barometer_")},
+        **{name: {"compass": True} for name in CARRIED if name.startswith("compass_")},
+        **{n: {"light": True} for n in CARRIED if n.startswith(("light_", "lamp"))},
+        **{n: {"rssi": True} for n in CARRIED if n.startswith(("rssi_", "access"))},
+        "rssi_wall_loss": {"rssi": True, "walls": IN_THE_WAY},
+        **{name: {"ultrasonic": True} for name in CARRIED if name.startswith("ultrasonic_")},
+        **{
+            n: {"magnetic": True}
+            for n in CARRIED
+            if n.startswith(("magnetic_", "anomaly_", "build"))
+        },
         "gnss_outage_time": {"gnss": True, "gnss_outage": 0.5},
     },
     "wsn-v0": {**RANGES_WITH, **FAILING, "kidnapped": {"kidnap_at": 0.2, "n_uavs": 2}},

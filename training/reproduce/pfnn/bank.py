@@ -27,7 +27,7 @@ def gain_table(results: Results) -> Table | None:
     """Per-world RMSE, geometric mean over worlds, of Huber's weights, trust alone and its banks,
     and the share of the log gain that is kept; None unless all were run."""
     agents = robust_agents(results.settings)
-    banks = [a for a in agents if a.startswith("ekf_trust") and a != ALONE]
+    banks = [a for a in agents if a.startswith(("ekf_trust", "pf_trust")) and a != ALONE]
     if HUBER not in agents or ALONE not in agents or not banks:
         return None
     rows = []

@@ -51,6 +51,33 @@ ORACLE = Kind(
     "training.reproduce.pfnn.oracle:load",
     ("training.reproduce.pfnn.oracle",),
 )
+# Inside the paper's circle a pillar, about it two walls with gaps (m).
+WALLS = (
+    14.0,
+    9.0,
+    0.0,
+    16.0,
+    11.0,
+    5.0,
+    10.0,
+    0.0,
+    0.0,
+    10.2,
+    14.0,
+    5.0,
+    20.0,
+    6.0,
+    0.0,
+    20.2,
+    20.0,
+    5.0,
+)
+INTERMITTENT = {"uwb_outage": 0.5, "uwb_outage_time": 5.0}
+PROGRAMMES = {  # of the paper's last section; the third is ``INTERMITTENT``
+    "aggressive": "aggressive (jerk-limited)",
+    "multi_scale": "multi-scale",
+    "formation": "formation change",
+}
 _FULL = (
     *("default", "uniform", "nlos", "false", "few", "dropout", "blind6", "blind20"),
     *("few-nlos", "few-nlos-false", "hard", "away-nlos-false"),
@@ -84,7 +111,7 @@ def robust_agents(settings: Settings) -> tuple[str, ...]:
 
 def variants(steps: int | None = None) -> list[Variant]:
     """The paper's own experiment, one difficulty at a time, several, and worlds unlike those that
-    learned parts were trained on."""
+    learned parts were trained on; the paper's four programmes are among them."""
 
     def indoor(key: str, title: str, **overrides: Any) -> Variant:
         return Variant(key, title, tuple(overrides.items()), steps=steps)
@@ -105,10 +132,16 @@ def variants(steps: int | None = None) -> list[Variant]:
         indoor("few-nlos-false", "5 landmarks + NLOS + false", **hard),
         indoor("hard", "all hard", **hard, prior="uniform", landmark_dropout=0.5),
         *(
-            indoor(motion, motion.replace("_", " "), motion=motion)
+            indoor(motion, PROGRAMMES.get(motion, motion.replace("_", " ")), motion=motion)
             for motion in MOTIONS
             if motion != "circle"
         ),
+        indoor("intermittent", "intermittent UWB", **INTERMITTENT),
+        indoor("few-intermittent", "5 landmarks + intermittent UWB", **few, **INTERMITTENT),
+        indoor("walls", "walls", walls=WALLS),
+        indoor("walls-obstacles", "walls + 6 obstacles", walls=WALLS, obstacles=6),
+        indoor("field", "field of view 90°", landmark_field=1.57),
+        indoor("gusts", "gusts 0.3 m/s²", gust_std=0.3),
         indoor("uavs8", "8 UAVs", n_uavs=8),
         indoor("room", "room 20×30×4 m", room=away["room"]),
         indoor("landmarks12", "12 landmarks", landmarks=12),

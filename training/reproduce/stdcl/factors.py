@@ -16,7 +16,8 @@ BEFORE = "map:bias=own:factors=weights"
 JOINT = "map:bias=joint:factors=weights"
 WHOLE = "map:bias=joint:factors=ep"
 LEARNED = "stdcl"
-METHODS = (BEFORE, JOINT, WHOLE, LEARNED)
+RIVALS = ("map:confidence=huber", "map:confidence=gnc", "map:factors=weights:starts=5")
+METHODS = (BEFORE, JOINT, WHOLE, LEARNED, *RIVALS)
 _SIZE = (6694.0, 6694.0, 3347.0)  # m: the density of 200 UAVs in 10 × 10 × 5 km
 _S3_STEPS = 1200  # of 9000: two minutes of the patrol
 

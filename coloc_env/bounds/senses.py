@@ -1,0 +1,88 @@
+"""Fisher information of compass, lamps, signal strength, ultrasound and magnetic field about a
+UAV's own pose, registered with ``information``.
+
+Hᵀ R⁻¹ H as there, H by the very functions that the sensors measure with; masks say what arrived.
+What is behind a wall stays there however the truth is moved, and the error of a magnetic map counts
+as known: no estimator knows more.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from coloc_env.bounds.information import own_information
+from coloc_env.bounds.mixture import EXACT
+from coloc_env.geometry import cross_matrix, rotation_matrix
+from coloc_env.motion import Kinematics
+from coloc_env.observation import Observation
+from coloc_env.sensors import Compass, Light, Magnetic, Rssi, Ultrasonic
+from coloc_env.sensors.compass import heading
+
+
+@own_information.register
+def _compass(sensor: Compass, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """z = ψ(R) + N(0, σ²)."""
+    _, by_turn = heading(rotation_matrix(truth.attitude))
+    rows = torch.cat((torch.zeros_like(truth.position), by_turn), -1).unsqueeze(-2)
+    return _gram(rows, seen["compass_mask"].double() / max(sensor.std, EXACT) ** 2)
+
+
+@own_information.register
+def _rssi(sensor: Rssi, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """z = P₀ − 10 n log₁₀ ‖p − A‖ − losses + N(0, σ²)."""
+    d = truth.position.shape[-1]
+    points = seen["rssi_map"].double().unflatten(-1, (-1, d))
+    _, gradient = sensor.expected(truth.position.unsqueeze(-2), points)
+    rows = torch.nn.functional.pad(gradient, (0, 3 if d == 3 else 1))
+    return _gram(rows, seen["rssi_mask"].double() / max(sensor.std, EXACT) ** 2)
+
+
+@own_information.register
+def _ultrasonic(
+    sensor: Ultrasonic, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D D"]:
+    """z = t(p, R) + N(0, σ²)."""
+    _, rows = sensor.expected(truth.position, rotation_matrix(truth.attitude))
+    return _gram(rows, seen["ultrasonic_mask"].double() / max(sensor.std, EXACT) ** 2)
+
+
+@own_information.register
+def _magnetic(sensor: Magnetic, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """z = Rᵀ B(p) + N(0, σ² I)."""
+    rotation = rotation_matrix(truth.attitude)
+    field, slope = sensor.field(truth.position)
+    turned = cross_matrix((rotation.mT @ field.unsqueeze(-1))[..., 0])  # [Rᵀ B]×
+    rows = torch.cat((rotation.mT @ slope, turned), -1)
+    return _gram(rows, seen["magnetic_mask"].double() / max(sensor.std, EXACT) ** 2)
+
+
+@own_information.register
+def _light(sensor: Light, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
+    """Intensities N(I, s²) with s² = (ε I)² + f², which have 1 / s² + 2 (ds/dI / s)² about I (Kay
+    1993, eq. 3.31); directions of von Mises and Fisher, which have κ (coth κ − 1/κ) across."""
+    there = seen["light_mask"].double()
+    lamps = seen["light_map"].double().unflatten(-1, (-1, 3))
+    apart = lamps - truth.position.unsqueeze(-2)
+    intensity, gradient = sensor.intensity(apart)
+    variance = sensor.variance(intensity).clamp_min(EXACT**2)
+    by_size = 1 / variance + 2 * (sensor.share**2 * intensity / variance) ** 2
+    bright = _gram(torch.nn.functional.pad(-gradient, (0, 3)), there * by_size)
+    rotation = rotation_matrix(truth.attitude)
+    r = apart.norm(dim=-1, keepdim=True).clamp_min(EXACT)
+    seen_way = (apart / r) @ rotation  # u = Rᵀ v / r
+    along = seen_way.unsqueeze(-1) * seen_way.unsqueeze(-2)
+    eye = torch.eye(3, dtype=along.dtype, device=along.device)
+    by_place = (along - eye) @ rotation.mT.unsqueeze(-3) / r.unsqueeze(-1)
+    rows = torch.cat((by_place, cross_matrix(seen_way)), -1)  # [B, N, K, 3, 6]
+    kappa = 1 / sensor.angle_std**2
+    across = kappa * (1 / math.tanh(kappa) - 1 / kappa)
+    return bright + _gram(rows.flatten(-3, -2), (across * there).repeat_interleave(3, -1))
+
+
+def _gram(
+    rows: Float64[Tensor, "B N M D"], weights: Float64[Tensor, "B N #M"]
+) -> Float64[Tensor, "B N D D"]:
+    """``Σ_m w_m h_m h_mᵀ``."""
+    return (rows.mT * weights.unsqueeze(-2)) @ rows
