@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnlabelledLandmarks(Sensor):
-    """Leaves ``unlabelled_landmarks`` [L · d] and ``unlabelled_landmark_mask`` [L], ``landmark_map``
+    """Leaves ``unlabelled_landmarks`` [L · d], ``unlabelled_landmark_mask`` [L] and ``landmark_map``
     [L · d].
 
     What ``labelled`` landmarks give (vectors in the body frame, m), in an order that is drawn for
