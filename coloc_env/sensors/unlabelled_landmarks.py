@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnlabelledLandmarks(Sensor):
-    """Leaves ``unlabelled_landmarks`` [L · d], ``unlabelled_landmark_mask`` [L] and ``landmark_map``
-    [L · d].
+    """Leaves ``unlabelled_landmarks`` [L · d] with ``unlabelled_landmark_mask`` [L], and the map,
+    ``landmark_map`` [L · d].
 
     What ``labelled`` landmarks give (vectors in the body frame, m), in an order that is drawn for
     every UAV and step: entry m is that of any landmark of the map.
