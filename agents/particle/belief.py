@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -20,8 +20,9 @@ class ParticleBelief(TensorClass):
     """Particles (float32) with normalized log-weights (−∞ for slots beyond ``count``), the UAV's
     own random key, steps taken, the last effective sample size as a share of its count, whether the
     last step redrew it from an EKF's posterior, position and velocity of the last estimate (of the
-    prior before), what sensors' biases have made of the error (see ``agents.models.biases``), and
-    what the screen remembers; batch (B, N)."""
+    prior before), what sensors' biases have made of the error (see ``agents.models.biases``),
+    what the screen remembers, and the covariance of what particles hold only the mean of (of width
+    0: nothing); batch (B, N)."""
 
     particles: Float32[Tensor, "B N M S"]
     log_weights: Float32[Tensor, "B N M"]
@@ -33,6 +34,7 @@ class ParticleBelief(TensorClass):
     last: Float32[Tensor, "B N 2*d"]
     considered: Float[Tensor, "B N E G"]
     memory: Float[Tensor, "B N K"]
+    conditional: Float64[Tensor, "B N L L"]
 
     def shifted(self, offset: Float[Tensor, "B N d"]) -> "ParticleBelief":
         """Its position shifted by ``offset`` (m)."""

@@ -28,6 +28,11 @@ class Evidence:
     residuals: Float32[Tensor, "B N A"]
     count: Float32[Tensor, "B N"]
 
+    @property
+    def rms(self) -> Float32[Tensor, "B N"]:
+        """√(Σ r² / n), m: what is left of d where nothing is believed of the noise."""
+        return (self.residuals.square().sum(-1) / self.count.clamp_min(1.0)).sqrt()
+
 
 def evidence(
     model: AnchorRanges,
@@ -68,6 +73,16 @@ class ChiSquare(Detector):
     def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
         limits = self.limits.to(seen.count.device)[seen.count.long()]
         return (seen.distance > limits).float()
+
+
+class ResidualSum(Detector):
+    """Failed if the residuals' root mean square √(Σ r² / n) is beyond a ``limit`` (m)."""
+
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
+
+    def probability(self, seen: Evidence) -> Float32[Tensor, "B N"]:
+        return (seen.rms > self.limit).float()
 
 
 class FailureDetector(Learned):

@@ -5,12 +5,12 @@ Neighbours enter as ranges whose variance is inflated by the sender's own uncert
 live in padded tensors with a live count per UAV, fixed or adaptive (PF-NN paper, Algorithms 1, 2).
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
 from agents.association import AssociationName, associated
@@ -40,12 +40,31 @@ from coloc_env.sensors import UnlabelledLandmarks
 
 Proposal = Literal["prior", "ekf"]
 Renewal = Literal["ekf", "none"]
+Foreseen = tuple[
+    Float32[Tensor, "B N M S"],
+    Float32[Tensor, "B N M"],
+    Float32[Tensor, "B N M"],
+    Bool[Tensor, "B N"],
+]  # particles, log-weights, log-likelihoods, whether too few count
 Variant = Literal["regularized", "paper"]
 Particles = Annotated[int, Quantity("", 10, 100_000)]
 Pairing = Literal["mixture", "nearest", "joint"]
 Likelihood = Literal["gaussian", "student", "mixture"]
 _TAILS = {"gaussian": None, "student": student_log_density, "mixture": mixture_log_density}
 _USUAL = ("liu_west", "ekf", "prior", "none")  # perturb, renewal, proposal, robust
+
+
+@dataclass(frozen=True)
+class Updated:
+    """A cloud after a step's measurements: particles, log-weights (not normalized), which UAVs'
+    were redrawn from an EKF's posterior, the Gaussian update beside it where anything asks for one,
+    and the covariance of what particles hold only the mean of."""
+
+    particles: Float32[Tensor, "B N M S"]
+    log_weights: Float32[Tensor, "B N M"]
+    renewed: Bool[Tensor, "B N"]
+    density: ImportanceDensity | None
+    conditional: Float64[Tensor, "B N L L"]
 
 
 class ParticleFilter(Localizer[ParticleBelief]):
@@ -161,6 +180,7 @@ class ParticleFilter(Localizer[ParticleBelief]):
             last=mean[..., : 2 * self.process.dim],
             considered=self.biases.initial(observation, covariance.double()),
             memory=self.screen.memory(observation),
+            conditional=covariance.new_zeros(*key.shape, 0, 0, dtype=torch.float64),
             batch_size=key.shape,
         )
 
@@ -178,10 +198,10 @@ class ParticleFilter(Localizer[ParticleBelief]):
                 neighbours = replace(neighbours, variance=torch.zeros_like(neighbours.variance))
         trusts = [Trust()] * len(self.models)
         now = Step(belief, observation, neighbours, trusts, key, self.association)
-        particles, log_weights, renewed, density = self._updated(now)
-        weighed = self.resampling.weigh(particles, log_weights, belief.count)
+        found = self._updated(now)
+        weighed = self.resampling.weigh(found.particles, found.log_weights, belief.count)
         particles, log_weights = self.resampling.next_particles(
-            particles, weighed, belief.count, key
+            found.particles, weighed, belief.count, key
         )
         cloud = self.resampling.estimated(weighed, particles, log_weights)
         mean = cloud.mean
@@ -194,10 +214,11 @@ class ParticleFilter(Localizer[ParticleBelief]):
             key=belief.key,
             step=belief.step + 1,
             ess_share=weighed.ess / belief.count,
-            renewed=renewed,
+            renewed=found.renewed,
             last=mean[..., : 2 * self.process.dim],
-            considered=self._considered(now, density),
-            memory=belief.memory if density is None else density.posterior.memory,
+            considered=self._considered(now, found.density),
+            memory=belief.memory if found.density is None else found.density.posterior.memory,
+            conditional=found.conditional,
         )
         return after, self._estimate(cloud, after.considered)
 
@@ -256,17 +277,8 @@ class ParticleFilter(Localizer[ParticleBelief]):
             return self.capacity
         return min(self.capacity, int(count.max()) + particle_count.GROW)
 
-    def _updated(
-        self, now: Step
-    ) -> tuple[
-        Float32[Tensor, "B N M S"],
-        Float32[Tensor, "B N M"],
-        Bool[Tensor, "B N"],
-        ImportanceDensity | None,
-    ]:
-        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x): particles, their log-weights (not
-        normalized), which were redrawn from an EKF's posterior, and the Gaussian update beside it,
-        where anything asks for one."""
+    def _updated(self, now: Step) -> Updated:
+        """Prediction x ~ p(x | x⁻, u) and update w ← w p(z | x)."""
         belief = now.belief
         slots = self._slots(belief.count)
         particles, log_weights = belief.particles[..., :slots, :], belief.log_weights[..., :slots]
@@ -288,15 +300,28 @@ class ParticleFilter(Localizer[ParticleBelief]):
             gain = self._evidence(particles, log_weights, now)
             few = self._degenerate(log_weights + gain, now)
         else:
-            particles, gain, few = self._foresee(particles, log_weights, u, dt, draws, now)
+            foreseen = self._foresee(particles, log_weights, u, dt, draws, now)
+            particles, log_weights, gain, few = foreseen
         if not (self.models and bool(few.any())):
-            return particles, log_weights + gain, renewed, density
+            return Updated(particles, log_weights + gain, renewed, density, belief.conditional)
+        found = self._rejuvenated(particles, log_weights, gain, few, now, density)
+        return Updated(found[0], found[1], renewed | found[2], density, belief.conditional)
+
+    def _rejuvenated(
+        self,
+        particles: Float32[Tensor, "B N M S"],
+        log_weights: Float32[Tensor, "B N M"],
+        gain: Float32[Tensor, "B N M"],
+        few: Bool[Tensor, "B N"],
+        now: Step,
+        density: ImportanceDensity | None = None,
+    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
+        """What ``Rejuvenation`` makes of evidence that leaves too ``few``."""
         evidence, renews = partial(self._evidence, now=now), self.renewal == "ekf"
         rejuvenation = Rejuvenation(
             evidence, self.screen, self.resampling, now, renews, self.heavy or self.screen
         )
-        found = rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
-        return found[0], found[1], renewed | found[2], density
+        return rejuvenation.rejuvenate(particles, log_weights, gain, few, density)
 
     def _foresee(
         self,
@@ -306,12 +331,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
         dt: Float32[Tensor, "B N 1"],
         draws: Float32[Tensor, "B N M W"],
         now: Step,
-    ) -> tuple[Float32[Tensor, "B N M S"], Float32[Tensor, "B N M"], Bool[Tensor, "B N"]]:
-        """Each particle propagated with its own draw of process noise, its log-likelihood, and
-        whether that leaves too few."""
+    ) -> Foreseen:
+        """Each particle propagated with its own draw of process noise, its log-weight before the
+        evidence, its log-likelihood, and whether that leaves too few."""
         particles = self.process.propagate(particles, u, dt, draws)
         gain = self._evidence(particles, log_weights, now)
-        return particles, gain, self._degenerate(log_weights + gain, now)
+        return particles, log_weights, gain, self._degenerate(log_weights + gain, now)
 
     def _degenerate(self, log_weights: Float32[Tensor, "B N M"], now: Step) -> Bool[Tensor, "B N"]:
         """Whose weights are those of too few particles, which tempering would mend."""
@@ -377,4 +402,12 @@ class ParticleFilter(Localizer[ParticleBelief]):
             position=cloud.mean[..., :d],
             velocity=cloud.mean[..., d : 2 * d],
             covariance=covariance[..., :d, :d] + least,
+        )
+
+
+def refuse_biases(localizer: ParticleFilter) -> None:
+    """Raise NotServed where sensors are believed to be biased, which a filter would ignore."""
+    if localizer.biases:
+        raise NotServed(
+            "the biases that sensors are believed to have would be ignored: pf500 considers them"
         )

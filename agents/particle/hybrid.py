@@ -27,13 +27,15 @@ _ILL = 30.0  # ratio of standard deviations beyond which a position is a line
 
 
 class HybridBelief(TensorClass):
-    """Both filters' beliefs, the Mahalanobis distance d and the probability of a failure that were
-    found last, for how many steps in a row it counts as failed, and whether the main filter was
-    restarted in the last (or a restart was put on trial); batch (B, N)."""
+    """Both filters' beliefs, the Mahalanobis distance d, the residuals' root mean square (m) and
+    the probability of a failure that were found last, for how many steps in a row it counts as
+    failed, and whether the main filter was restarted in the last (or a restart was put on trial);
+    batch (B, N)."""
 
     main: Any
     auxiliary: Any
     distance: Float32[Tensor, "B N"]
+    residual: Float32[Tensor, "B N"]
     probability: Float32[Tensor, "B N"]
     alarms: Int64[Tensor, "B N"]
     reset: Bool[Tensor, "B N"]
@@ -97,6 +99,7 @@ class HybridFilter(Localizer[HybridBelief]):
             main=self.main.reset(observation),
             auxiliary=self.auxiliary.reset(observation),
             distance=nothing,
+            residual=nothing,
             probability=nothing,
             alarms=torch.zeros_like(nothing, dtype=torch.int64),
             reset=nothing > 0,
@@ -133,6 +136,7 @@ class HybridFilter(Localizer[HybridBelief]):
             main=main,
             auxiliary=auxiliary,
             distance=seen.distance,
+            residual=seen.rms,
             probability=probability,
             alarms=alarms * ~rows,
             reset=rows,
@@ -146,7 +150,11 @@ class HybridFilter(Localizer[HybridBelief]):
         return belief.replace(main=self.main.shifted(belief.main, offset))
 
     def diagnostics(self, belief: HybridBelief) -> dict[str, Float[Tensor, "B N"]]:
-        own = {"mahalanobis": belief.distance, "failure": belief.probability}
+        own = {
+            "mahalanobis": belief.distance,
+            "residual_rms": belief.residual,
+            "failure": belief.probability,
+        }
         own["trials_per_run" if self.on_trial else "resets_per_run"] = belief.reset.float()
         return self.main.diagnostics(belief.main) | own
 

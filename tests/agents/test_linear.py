@@ -206,10 +206,10 @@ def test_robust_filters_leave_honest_measurements_alone(linear: SimpleNamespace)
 # ---------------------------------------------------------------- particles
 
 
-def distance_to_kalman(particles: int, linear: Any) -> tuple[float, float]:
+def distance_to_kalman(name: str, particles: int, linear: Any) -> tuple[float, float]:
     """Root mean square difference of mean and of variance from the Kalman filter, in its σ, σ²."""
     kalman = run("ekf:cooperate=false", linear, 15, 10)
-    sampled = run(f"pf800:particles={particles}:cooperate=false", linear, 15, 10)
+    sampled = run(f"{name}:particles={particles}:cooperate=false", linear, 15, 10)
     mean, variance = [], []
     for exact, ours in zip(kalman, sampled, strict=True):
         spread = exact.estimate.covariance.diagonal(dim1=-2, dim2=-1)
@@ -219,8 +219,18 @@ def distance_to_kalman(particles: int, linear: Any) -> tuple[float, float]:
     return tuple(float(torch.stack(x).square().mean().sqrt()) for x in (mean, variance))
 
 
-def test_particles_tend_to_the_kalman_filter(linear: SimpleNamespace) -> None:
-    few, many = distance_to_kalman(100, linear), distance_to_kalman(6400, linear)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pf800",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("pf_auxiliary", "pf_mixture:carried=0", "pf_rao_blackwell")
+        ),
+    ],
+)
+def test_particles_tend_to_the_kalman_filter(name: str, linear: SimpleNamespace) -> None:
+    few, many = (distance_to_kalman(name, m, linear) for m in (100, 6400))
     assert many[0] < 0.045
     assert many[1] < 0.06
     for less, more in zip(many, few, strict=True):

@@ -86,6 +86,7 @@ def test_every_shipped_checkpoint_says_how_it_was_trained() -> None:
         card = json.loads((folder / f"{name}.json").read_text())
         assert {"command", "options", "versions", "scores"} <= card.keys()
         assert card["command"].startswith("coloc train ")
+        assert " /" not in card["command"], "a card names no folder of the machine it was made on"
 
 
 def test_shipped_by_name() -> None:

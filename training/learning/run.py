@@ -214,7 +214,7 @@ def _train(folder: Path, config: Mapping[str, Any], training: Training, progress
     _require_learned(name, training)
     defaults = {key: one.default for key, one in TRAININGS.options_of(name).items()}
     card = {
-        "command": config["command"],
+        "command": config["command"].rsplit(" --out ", 1)[0] + " --out DIR",  # of any machine
         "training": name,
         "options": defaults | config["options"],
         "epochs": collector.epochs,

@@ -19,6 +19,7 @@ from agents.particle.failure import (
     Evidence,
     FailureDetector,
     NeuralDetector,
+    ResidualSum,
     evidence,
     network_features,
 )
@@ -140,6 +141,17 @@ def test_alarms_at_the_truth_are_as_frequent_as_promised(
     truth, seen = sensed(scenario, 3000)
     found = ChiSquare(0.9, 4).probability(looked_at(scenario, truth[..., :2], seen))
     assert low <= found.mean() <= high
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_the_residuals_detector_is_a_limit_on_their_rms(count: int) -> None:
+    """Whatever d says, and however many ranges there are."""
+    residuals = torch.zeros(2, 1, 4)
+    residuals[0, :, :count], residuals[1, :, :count] = 0.49, 0.51
+    seen = Evidence(torch.full((2, 1), 1e9), residuals, torch.full((2, 1), float(count)))
+    assert ResidualSum(0.5).probability(seen)[:, 0].tolist() == [0.0, 1.0]
+    none = Evidence(*(torch.zeros(1, 1, *shape) for shape in ((), (4,), ())))
+    assert ResidualSum(0.5).probability(none).tolist() == [[0.0]]
 
 
 @pytest.mark.parametrize("quantile", [0.0, 1.0, -0.1, 1.5])

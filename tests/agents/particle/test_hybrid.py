@@ -313,7 +313,7 @@ def test_what_it_is_made_of_can_be_seen(tools: SimpleNamespace) -> None:
     localizer = hybrid("hpff:bank=false:main=apf@particles=40@bounds=30,60", scenario)
     belief = tools.play(localizer, scenario, [0, 1], 3).beliefs[-1]
     figures = localizer.diagnostics(belief)
-    parts = {"particles", "ess_share", "renewed", "bytes", "mahalanobis", "failure"}
+    parts = {"particles", "ess_share", "renewed", "bytes", "mahalanobis", "residual_rms", "failure"}
     assert set(figures) == {*parts, "resets_per_run"}
     assert torch.equal(figures["particles"], localizer.main.diagnostics(belief.main)["particles"])
     assert torch.equal(figures["mahalanobis"], belief.distance)

@@ -265,6 +265,7 @@ def test_interrupted_in_training(
     assert outcome(tmp_path / "run") == unbroken
 
 
+@pytest.mark.slow
 def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "SCORED", ("", "nlos=0.3"))
     options = {**SMALL, "epochs": 1, "score_runs": 1}

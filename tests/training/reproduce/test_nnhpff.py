@@ -12,7 +12,7 @@ from sklearn import metrics
 from agents import make
 from coloc_env.scenarios import make_scenario
 from training.reproduce.measures import mean_error
-from training.reproduce.nnhpff import detection, nnhpff, plan
+from training.reproduce.nnhpff import detection, nnhpff, noise, plan
 from training.reproduce.nnhpff.claims import claims
 from training.reproduce.nnhpff.plan import (
     HELD,
@@ -35,6 +35,7 @@ from training.reproduce.verdicts import (
     away_from_zero,
     judge,
 )
+from training.reproduce.work import Piece
 
 RUNS, STEPS = 12, 360
 
@@ -94,6 +95,20 @@ def test_calibration_is_scikit_learns() -> None:
     assert found.brier == pytest.approx(metrics.brier_score_loss(failed, score))
     weighted = (np.abs(said - share) * found.count[full]).sum() / found.count.sum()
     assert found.error == pytest.approx(weighted)
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_no_threshold_is_less_wrong(ties: bool) -> None:
+    score, failed = samples(ties)
+    found = detection.confusion(score, failed, detection.least_wrong(score, failed)).accuracy
+    every = np.concatenate(([-1.0], np.unique(score)))
+    assert found == max(detection.confusion(score, failed, x).accuracy for x in every)
+
+
+def test_all_of_one_kind_have_a_threshold_beyond_them() -> None:
+    score = np.array([0.1, 0.4])
+    assert detection.least_wrong(score, np.array([False, False])) >= 0.4
+    assert detection.least_wrong(score, np.array([True, True])) < 0.1
 
 
 # ---------------------------------------------------------------- runs
@@ -210,6 +225,7 @@ def test_every_scenario_of_the_plan_can_be_built(tmp_path: Path) -> None:
     assert len(plan.trained_on()) == 27
 
 
+@pytest.mark.slow
 def test_a_small_page(tmp_path: Path) -> None:
     variants = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
     agents = [
@@ -217,19 +233,52 @@ def test_a_small_page(tmp_path: Path) -> None:
         "hpff:bank=false",
         "nnhpff:bank=false",
         "nnhpff:bank=false:main=pf@particles=500:threshold=1",
+        plan.RESIDUALS,
     ]
     chosen: dict[str, Any] = {"agents": agents, "variants": variants, "steps": 25}
     reproduce(nnhpff(), Settings(tmp_path, 2, **chosen))
     text = (tmp_path / "page.md").read_text()
     assert "14 claims" in text
     assert "| case 1: noise known" in text
-    assert "| the 27 scenarios, other worlds | network | 25 |" in text
+    for name in ("network", "Σr² alone", "d alone"):
+        assert f"| the 27 scenarios, other worlds | {name} | 25 |" in text
     for name in ("figure_5_case_1.png", "figure_8_ale.png"):
         assert (tmp_path / name).exists()
     stored = sorted(file.stat().st_mtime for file in (tmp_path / "store").rglob("*.npz"))
     reproduce(nnhpff(), Settings(tmp_path, 2, report_only=True, **chosen))
     assert (tmp_path / "page.md").read_text() == text
     assert stored == sorted(file.stat().st_mtime for file in (tmp_path / "store").rglob("*.npz"))
+
+
+def test_detectors_over_several_noises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where only residuals tell, the network learns what a threshold on their sum has."""
+    rng = np.random.default_rng(0)
+
+    def made(std: float) -> noise.Samples:
+        error = rng.choice([0.1, 1.0], (4, 300))
+        residuals = np.abs(rng.normal(0, std, (4, 300, 4)) + 0.6 * (error > 0.5)[..., None])
+        rms, d = np.sqrt(np.mean(residuals**2, -1)), rng.random((4, 300))
+        features = np.concatenate((np.log1p(d)[..., None], residuals), -1)
+        return noise.Samples(*(x.astype(np.float32) for x in (features, d, rms, error)))
+
+    there = {std: made(std) for std in noise.JUDGED}
+    monkeypatch.setattr(noise, "_samples", lambda _, std: there[std])
+    (table,) = noise.tables(None)  # type: ignore[arg-type]
+    areas = {(row[0], row[1]): [float(x) for x in row[2:6]] for row in table.rows}
+    assert len(areas) == 6
+    for fitted in ("0.2", "0.1, 0.2, 0.4"):
+        assert min(areas[fitted, "network"][:2]) > 0.97
+        assert max(areas[fitted, "d"]) < 0.6
+    assert areas["0.2", "√(Σr²/n)"] == areas["0.1, 0.2, 0.4", "√(Σr²/n)"]  # a score, unfitted
+
+
+def test_what_detectors_see_is_recorded() -> None:
+    where = noise.variants(0.2, steps=5)[0]
+    arrays, _ = noise.compute(Piece(where, (noise.MAIN,), 0, 2, noise.SAMPLES), lambda *_: None)
+    found = noise.load(where, arrays, {})
+    assert found.features.shape == (2, 5, 5)
+    squared = (found.features[..., 1:] ** 2).mean(-1)
+    np.testing.assert_allclose(found.rms**2, squared, rtol=1e-4)
 
 
 def test_figure_4_is_trained_with_the_whole_study_only(tmp_path: Path) -> None:

@@ -13,13 +13,13 @@ from typer.testing import CliRunner, Result
 
 from agents import make
 from coloc_env.bounds import Bound
-from coloc_env.scenarios import make_scenario
+from coloc_env.scenarios import make_scenario, parse_scenario
 from training.cli.command import app
 from training.evaluation.record import Worlds
 from training.evaluation.rollout import rollout
 from training.reproduce.cost import Cost
 from training.reproduce.measures import rmse
-from training.reproduce.pfnn import oracle, paper, plan, robustness, tables
+from training.reproduce.pfnn import oracle, paper, plan, regimes, rivals, robustness, tables
 from training.reproduce.pfnn.claims import claims
 from training.reproduce.pfnn.plan import ABLATION, ONLINE, PRINTED, TABLE_AGENTS, Online
 from training.reproduce.results import Runs
@@ -449,3 +449,65 @@ def test_what_is_no_results_is_refused(content: str, tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "results.json holds no results of a study" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+# ---------------------------------------------------------------- more rivals, and regimes
+
+
+def test_rivals_have_accuracy_and_costs() -> None:
+    scenario = make_scenario("indoor-v0", horizon=4)
+    error = np.full((2, 4, 6), 0.3)
+    error[:, 2:], error[0, -1, :2] = 0.1, 5.0
+    one = runs_of(scenario, error)
+    found: Any = Made(
+        {}, {("pf500",): one, ("pf500", "cost"): Cost(np.array([3.0, 5.0]), 10**6, 2)}
+    )
+    found.settings = Settings(Path("x"), 4, steps=4)
+    found.runs = lambda name, agents: {a: one for a in agents if a == "pf500"}
+    found.kinds = lambda name, kind: {"pf500": found.get(name, "pf500", kind)}
+    *places, cost = rivals.tables(found)
+    assert len(places) == 5
+    whole, late = np.sqrt((error**2).mean()), np.sqrt((error[:, 2:] ** 2).mean())
+    for place in places:
+        assert place.rows == [["`pf500`", f"{whole:.3g}", f"{late:.3g}", "0.3", "3", "2 of 12"]]
+    assert cost.rows == [["`pf500`", "4.0", "1.000", "0.00"]]
+    names = [cell.agents for cell in rivals.cells(found.settings)]
+    assert len(names) == 6
+    for agent in names[0]:
+        make(agent, rivals.variants()[2].build())
+
+
+def test_a_regime_pairs_the_corrector_with_all_it_must_beat(tmp_path: Path) -> None:
+    settings = Settings(tmp_path, 6, steps=9)
+    where = regimes.regimes(9)[0]
+    scenario, level = make_scenario("indoor-v0", horizon=9), np.arange(1, 4)[:, None, None]
+    factors = {"apf": 1.0, regimes.trained(where, tmp_path): 0.9, "ekf": 0.5, WORLD: 9.0}
+    there = {
+        agent: runs_of(scenario, factor * level * np.ones((3, 9, 6)))
+        for agent, factor in factors.items()
+    }
+    there["pfnn:weights=none"] = there["apf"]
+    found: Any = Made({(where.key, agent): one for agent, one in there.items()})
+    found.found[where.key, "pfnn", "oracle"] = oracle.Oracle(
+        0.8 * level * np.ones((3, 9, 6)), np.ones((3, 9, 6))
+    )
+    found.settings = settings
+    found.runs = lambda name, agents: {
+        a: found.get(name, a) for a in agents if found.get(name, a) is not None
+    }
+    (table,) = regimes.tables(found)
+    (line,) = table.rows
+    cells = [cell.split(" ")[0] for cell in line]
+    assert cells[2:] == ["−10", "+0", "−20", "−50", "−10", "+80"]
+
+
+def test_every_regime_is_trained_in_and_builds(tmp_path: Path) -> None:
+    settings = Settings(tmp_path, 2)
+    every, trained = regimes.regimes(), list(regimes.trainings(settings))
+    assert len({v.key for v in every}) == len(every) == len(trained) == 14
+    for variant, training in zip(every, trained, strict=True):
+        learned_in = parse_scenario(dict(training.options)["scenario"])
+        assert learned_in.horizon == variant.build().horizon == 300
+        assert learned_in.overrides == {**variant.build().overrides, "horizon": 300}
+    chosen = Settings(tmp_path, 2, variants=["ranges-random"])
+    assert [t.key for t in regimes.trainings(chosen)] == ["ranges-random-300"]

@@ -1,6 +1,6 @@
 """NN-HPFF: its figures 4 to 8 and table 1, its detector in detail, and a study beyond."""
 
-from training.reproduce.nnhpff import claims, figures, plan, tables
+from training.reproduce.nnhpff import claims, figures, noise, plan, tables
 from training.reproduce.study import Part, Study
 
 
@@ -21,5 +21,6 @@ def nnhpff() -> Study:
         figures=figures.DETECTOR,
     )  # fmt: skip
     beyond = Part("Beyond the paper", plan.beyond, tables=tables.beyond, figures=figures.BEYOND)
-    parts = {"paper": own, "detector": detector, "robustness": beyond}
+    several = Part("Several true σ", noise.cells, noise.text, tables=noise.tables)
+    parts = {"paper": own, "detector": detector, "noise": several, "robustness": beyond}
     return Study("nnhpff", "NN-HPFF", plan.TITLE, 100, parts)

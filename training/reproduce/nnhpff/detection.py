@@ -97,6 +97,23 @@ def confusion(score: Floats, failed: Flags, threshold: float) -> Confusion:
     )
 
 
+def least_wrong(score: Floats, failed: Flags) -> float:
+    """The threshold at which most samples are called rightly: the first of them, in the middle
+    between two scores."""
+    order = np.argsort(score, kind="stable")
+    ranked, truth = score[order], failed[order]
+    # Called failed from rank i on: wrong are failures below, and sound ones from there on.
+    wrong = np.append(0, np.cumsum(truth)) + np.append(0, np.cumsum(~truth))[-1]
+    wrong = wrong - np.append(0, np.cumsum(~truth))
+    ends = np.concatenate(([-np.inf], ranked, [np.inf]))
+    possible = ends[1:] > ends[:-1]  # equal scores fall together
+    i = int(np.flatnonzero(possible)[wrong[possible].argmin()])
+    low, high = ends[i : i + 2]
+    if not np.isfinite(high):
+        return float(low)
+    return float(high - 1.0) if not np.isfinite(low) else float(0.5 * (low + high))
+
+
 def calibration(probability: Floats, failed: Flags) -> Calibration:
     """Whether of what is given a probability of 30 % three tenths fail, in ten even bins."""
     which = np.minimum((probability * BINS).astype(np.int64), BINS - 1)

@@ -24,8 +24,14 @@ _COLOURS = {
     "hpff:bank=false": "#E69F00",
     "nnhpff:bank=false": "#D55E00",
     "ekf": "#009E73",
+    plan.RESIDUALS: "#CC79A7",
 }
-_NAMES = {"pf": "PF", "hpff:bank=false": "HPFF", "nnhpff:bank=false": "NN-HPFF"}
+_NAMES = {
+    "pf": "PF",
+    "hpff:bank=false": "HPFF",
+    "nnhpff:bank=false": "NN-HPFF",
+    plan.RESIDUALS: "HPFF, Σr²",
+}
 
 
 def learning(results: Results) -> Figure | None:
@@ -109,8 +115,8 @@ def errors(results: Results) -> Figure | None:
 
 
 def detector(results: Results) -> Figure | None:
-    """The network as a detector: ROC (solid: network, dashed: Mahalanobis distance alone),
-    precision and recall, and whether its probability is one."""
+    """The network as a detector: ROC (solid: network, dotted: Σr² alone, dashed: Mahalanobis
+    distance alone), precision and recall, and whether its probability is one."""
     samples = {
         title: group
         for title, group in detections(results).items()
@@ -121,9 +127,9 @@ def detector(results: Results) -> Figure | None:
     figure, ((roc, precision, sure),) = panels(1, 3, (11.0, 3.8), "Detecting failures")
     for i, (title, group) in enumerate(samples.items()):
         colour = PALETTE[i % len(PALETTE)]
-        for score, dash in ((group.probability, "-"), (group.distance, "--")):
+        for (name, score), dash in zip(group.scores.items(), ("-", ":", "--"), strict=True):
             drawn = curve(score, group.failed)
-            words = f"{title}: {drawn.auc:.3f}" if dash == "-" else f"d alone: {drawn.auc:.3f}"
+            words = f"{title if name == 'network' else name}: {drawn.auc:.3f}"
             line: dict[str, Any] = {"color": colour, "linestyle": dash, "linewidth": 1.3}
             roc.plot(drawn.false_alarms, drawn.hits, label=words, **line)
             precision.plot(drawn.hits[1:], drawn.precision[1:], **line)

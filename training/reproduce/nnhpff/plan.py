@@ -16,13 +16,15 @@ from training.reproduce.settings import Settings
 from training.reproduce.work import Cell, Training, Variant
 
 TITLE = "Neural-network-aided hybrid particle/FIR filter, *Electronics* 2025, 14(21), 4346"
-METHODS = ("pf", "hpff:bank=false", "nnhpff:bank=false")
+RESIDUALS = "hpff:bank=false:detector=residuals"
+METHODS = ("pf", "hpff:bank=false", "nnhpff:bank=false", RESIDUALS)
 BESIDE = (
     "emvf",
     "ekf",
     "pf:tempering=true",
     "hpff:bank=false:main=ekf",
     "nnhpff:bank=false:main=ekf",
+    f"{RESIDUALS}:main=ekf",
 )
 CASES = {
     1: "case 1: noise known",
@@ -32,8 +34,8 @@ CASES = {
 MEMORIES, QUANTILES = (2, 5, 10), (0.95, 0.99)
 KIDNAPPED_AT, INDOOR_KIDNAPPED_AT = 18.0, 30.0  # s
 _INDOOR = (("anchors", 8), ("horizon", 600))  # four would lie in one plane through the room
-INDOOR_METHODS = ("pfnn", "hpff:bank=false:main=pfnn", "nnhpff:bank=false:main=pfnn")
-INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:bank=false:main=ekf")
+INDOOR_METHODS = ("pfnn", *(f"{agent}:main=pfnn" for agent in METHODS[1:]))
+INDOOR_BESIDE = ("ekf", "ekf:robust=huber", "nnhpff:bank=false:main=ekf", f"{RESIDUALS}:main=ekf")
 PATIENT = "patience=4"  # steps: longer than an outlier stays in the FIR filter's window
 FIRST_CORNER = 100  # step
 SETTLED = 20  # step from which a filter's start is over
@@ -141,7 +143,7 @@ def sensitivity(steps: int | None = None) -> list[Planned]:
 def kidnapping(steps: int | None = None) -> list[Planned]:
     """The robot, and half a team, are put somewhere else."""
     half = (("kidnap_at", INDOOR_KIDNAPPED_AT), ("kidnapped", (0, 1, 2)), *_INDOOR)
-    beside = ("ekf", "pf:tempering=true", "nnhpff:bank=false:main=ekf")
+    beside = ("ekf", "pf:tempering=true", "nnhpff:bank=false:main=ekf", f"{RESIDUALS}:main=ekf")
     return [
         (case(1, steps, kidnap_at=KIDNAPPED_AT), (*METHODS, *beside)),
         (case(3, steps, kidnap_at=KIDNAPPED_AT), (*METHODS, *beside)),

@@ -1,6 +1,15 @@
 """PF-NN: its tables 3 to 5 and figures 2 to 9, and a study of robustness beyond it."""
 
-from training.reproduce.pfnn import claims, figures, paper, plan, robustness, tables
+from training.reproduce.pfnn import (
+    claims,
+    figures,
+    paper,
+    plan,
+    regimes,
+    rivals,
+    robustness,
+    tables,
+)
 from training.reproduce.study import Part, Study
 
 
@@ -22,5 +31,13 @@ def pfnn() -> Study:
         tables=robustness.tables,
         figures=robustness.FIGURES,
     )
-    parts = {"paper": own, "robustness": beyond}
+    where = Part(
+        "Where the corrector works",
+        regimes.cells,
+        regimes.text,
+        tables=regimes.tables,
+        trainings=regimes.trainings,
+    )
+    more = Part("More rivals", rivals.cells, rivals.text, tables=rivals.tables)
+    parts = {"paper": own, "robustness": beyond, "rivals": more, "regimes": where}
     return Study("pfnn", "PF-NN", paper.TITLE, paper.RUNS, parts)
