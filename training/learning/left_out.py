@@ -12,13 +12,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from agents.models.measurements import Block
 from agents.robust import Prediction, Screen, Trust
 from coloc_env.observation import Observation
 
+_LEAST = 0.01  # share of the information on a measurement that the others have, to predict it
 DEGREES = 4.0  # of Student's t, as a bank scores its branches
 
 
@@ -58,22 +59,29 @@ class Watched(Screen):
         total = count = covariance.new_zeros(covariance.shape[:-2])
         for model, block, trust in zip(self.models, self.blocks, self.trusts, strict=True):
             if model.testable:
-                each = left_out(block, trust, covariance)
-                share = (0.5 if block.mutual else 1.0) * block.mask
+                each, counted = left_out(block, trust, covariance)
+                share = (0.5 if block.mutual else 1.0) * counted
                 total, count = total + (share * each).sum(-1), count + share.sum(-1)
         return total, count
 
 
 def left_out(
     block: Block, trust: Trust, covariance: Float[Tensor, "B N E E"]
-) -> Float[Tensor, "B N m"]:
-    """½ log|S| + ½ (ν + k) log(1 + d²/ν) of each measurement, from an estimate without it; 0 where
-    nothing was measured. ``block`` is linearized at the estimate with it, whose covariance P⁺ is
+) -> tuple[Float[Tensor, "B N m"], Bool[Tensor, "B N m"]]:
+    """½ log|S| + ½ (ν + k) log(1 + d²/ν) of each measurement, from an estimate without it, and
+    where that counts (0 elsewhere): where there is a measurement, and the others alone determine
+    what it measures. ``block`` is linearized at the estimate with it, whose covariance P⁺ is
     given."""
-    h, there = block.jacobian, block.mask.unsqueeze(-1)
+    h = block.jacobian
     g = h @ covariance.unsqueeze(-3) @ h.mT
-    w = trust.information(block).unsqueeze(-2)  # W of columns
+    w = trust.information(block)
     eye = torch.eye(h.shape[-2], dtype=h.dtype, device=h.device)
+    with torch.no_grad():
+        root = w.sqrt()
+        rest = eye - root.unsqueeze(-1) * g * root.unsqueeze(-2)  # I − W½ G W½
+        counted = block.mask & (torch.linalg.eigvalsh(rest)[..., 0] > _LEAST)
+    there = counted.unsqueeze(-1)
+    w = (w * there).unsqueeze(-2)  # W of columns
     a = torch.linalg.solve(eye - g * w, g)  # A = (I − G W)⁻¹ G
     used = trust.residual(block).masked_fill(~there, 0.0)
     r = block.residual.masked_fill(~there, 0.0) + ((a * w) @ used.unsqueeze(-1))[..., 0]
@@ -85,4 +93,4 @@ def left_out(
     logarithm = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     degrees = DEGREES + h.shape[-2]
     each = 0.5 * (logarithm + degrees * (squared / DEGREES).log1p())
-    return torch.where(block.mask, each, 0.0)
+    return torch.where(counted, each, 0.0), counted

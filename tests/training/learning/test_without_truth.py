@@ -172,7 +172,10 @@ def test_left_out_is_the_update_without_it(k: int) -> None:
     prior = root @ root.mT
     delta, after = posterior(prior, *information([block], [trust]))
     at = replace(block, residual=r - (h @ delta[..., None, :, None])[..., 0])
-    found = left_out(at, trust, after)
+    found, counted = left_out(at, trust, after)
+    assert torch.equal(counted, mask)
+    alone = replace(at, variance=variance * 1e-9)  # nothing else says what these measure
+    assert not left_out(alone, trust, after)[1].any()
     for i in range(m):
         if not mask[0, 0, i]:
             assert found[0, 0, i] == 0
