@@ -147,7 +147,7 @@ CHOSEN = {
     "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
-    "slam": ("unmapped",),
+    **dict.fromkeys(("slam", "slam_central"), ("unmapped",)),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
 SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
@@ -178,7 +178,7 @@ CASES = [
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *(("stdcl:variant=calibrated", f) for f in ("swarm", "campus")),
-    *((f"slam:maps={m}", "unmapped") for m in ("own", "shared")),
+    ("slam:maps=own", "unmapped"),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
 ]
 CASES = [case for case in CASES if case not in REFUSED]
@@ -240,7 +240,8 @@ def room(name: str, **overrides: Any) -> Scenario:
     if name in ("stdcl", "stgat"):
         return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
     if "unmapped" in chosen:
-        return make_scenario("indoor-v0", landmarks_known=False, **overrides)
+        few = {"landmarks_known": False, "landmarks": 6, "anchors": 4}
+        return make_scenario("indoor-v0", **few, **overrides)
     if "sight" in chosen:
         return make_scenario("indoor-v0", uwb=False, **overrides)
     among: dict[str, Any] = {} if "default" in chosen else {"anchors": 8, "landmarks": 0}

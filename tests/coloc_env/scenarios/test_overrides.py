@@ -107,6 +107,7 @@ CARRIED: dict[str, Any] = {
     "light_radius": 5.0,
     "rssi": True,
     "access_points": 3,
+    "rssi_uavs": True,
     "rssi_std": 9.0,
     "rssi_power": -30.0,
     "rssi_exponent": 3.0,
@@ -278,6 +279,7 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"compass": True} for name in CARRIED if name.startswith("compass_")},
         **{n: {"light": True} for n in CARRIED if n.startswith(("light_", "lamp"))},
         **{n: {"rssi": True} for n in CARRIED if n.startswith(("rssi_", "access"))},
+        "rssi_uavs": {},
         "rssi_wall_loss": {"rssi": True, "walls": IN_THE_WAY},
         **{name: {"ultrasonic": True} for name in CARRIED if name.startswith("ultrasonic_")},
         **{
