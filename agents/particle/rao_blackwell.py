@@ -1,6 +1,8 @@
 """The Rao–Blackwellized particle filter (Doucet, de Freitas, Murphy & Russell 2000; marginalized as
 Schön, Gustafsson & Nordlund 2005)."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import torch
@@ -37,6 +39,15 @@ class _Seen:
         """log N(r; 0, R + H P Hᵀ) + const = −½ rᵀ R⁻¹ r + ½ bᵀ P⁺ b with b = Hᵀ R⁻¹ r."""
         gained = (self.vector @ self.conditional.to(self.vector.dtype)) * self.vector
         return 0.5 * (gained.sum(-1) - self.squared)
+
+    def where(self, rows: Bool[Tensor, "B N"], other: _Seen) -> _Seen:
+        """This one for the UAVs marked, another for the rest."""
+        one, two = rows.unsqueeze(-1), rows[..., None, None]
+        return _Seen(
+            torch.where(one, self.squared, other.squared),
+            torch.where(two, self.vector, other.vector),
+            torch.where(two, self.conditional, other.conditional),
+        )
 
 
 class RaoBlackwellFilter(ParticleFilter):
@@ -111,7 +122,7 @@ class RaoBlackwellFilter(ParticleFilter):
         if bool(few.any()):
             found = self._rejuvenated(particles, log_weights, seen.log_likelihood, few, now)
             particles, log_weights, _ = found
-            seen = self._seen(particles, log_weights, now)
+            seen = seen.where(~few, self._seen(particles, log_weights, now))
         else:
             log_weights = log_weights + seen.log_likelihood
         rest = seen.vector @ seen.conditional.to(draws.dtype)  # δ = P⁺ Hᵀ R⁻¹ r
