@@ -56,6 +56,7 @@ LOCALIZERS = Registry(
         "pose_graph": "agents.factor_graph.pose_graph:PoseGraph",
         "sb3-ppo": "agents.policies.sb3_ppo:Sb3Ppo",
         "slam": "agents.slam.slam:Slam",
+        "slam_central": "agents.slam.slam_central:CentralSlam",
         "stdcl": "agents.stdcl.stdcl:StDcl",
         "stein_vi": "agents.stein.stein_vi:SteinViFilter",
         "stgat": "agents.stdcl.stgat:StGat",

@@ -48,6 +48,7 @@ def loaded(code: str) -> set[str]:
     return set(done.stderr.split())
 
 
+@pytest.mark.slow
 def test_the_slow_are_not_loaded_before_they_are_used() -> None:
     slow = {"scipy.signal", "scipy.stats", "matplotlib", "torchrl", "stable_baselines3"}
     assert not loaded("import coloc_env; coloc_env.parallel_env") & (slow | {"tensordict"})

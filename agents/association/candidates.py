@@ -35,7 +35,7 @@ def candidates(model: LandmarkVectors, process: Process, prior: Prediction) -> C
     """All pairings of what is seen without names with the map."""
     seen, d, x = prior.observation, process.dim, prior.state
     z = seen["unlabelled_landmarks"].unflatten(-1, (-1, d))
-    z, mask = usable(z, seen["unlabelled_mask"] > 0)
+    z, mask = usable(z, seen["unlabelled_landmark_mask"] > 0)
     z, turn = z.to(x.dtype), process.attitude_error
     pose = [*range(d), *([] if turn is None else range(turn.start, turn.stop))]
     points = seen["landmark_map"]

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
+from torch.nn.functional import pad
 
 from agents.association import AssociationName
 from agents.association.clutter import reach_volume
@@ -31,8 +32,9 @@ Hypotheses = Annotated[int, Quantity("", 1, 1000)]
 
 
 class HypothesesBelief(TensorClass):
-    """K hypotheses, the likeliest first: normalized log-weights (−∞: given up), mean states, error
-    covariances, and what each EKF keeps beside them (see ``GaussianBelief``); batch (B, N)."""
+    """K hypotheses, the likeliest first: normalized log-weights (−∞: given up, and the likeliest is
+    in its place), mean states, error covariances, and what each EKF keeps beside them (see
+    ``GaussianBelief``); batch (B, N)."""
 
     log_weights: Float64[Tensor, "B N K"]
     state: Float64[Tensor, "B N K S"]
@@ -111,14 +113,21 @@ class MultiHypothesisEkf(Localizer[HypothesesBelief]):
         log_weights = hypotheses.reweighed(belief.log_weights[..., :k] + evidence)
         log_weights = hypotheses.merged(self.process, state, covariance, log_weights)
         order = hypotheses.by_weight(log_weights)
+        log_weights = log_weights.gather(-1, order)
+        gone = log_weights == -torch.inf
+        slots = belief.log_weights.shape[-1]
+
+        def kept(x: Tensor) -> Tensor:
+            return _in_slots(_ordered(x, order), gone, slots)
+
         now = build(
             HypothesesBelief,
             belief.step.shape,
-            log_weights=_padded(_ordered(log_weights, order), belief.log_weights, -torch.inf),
-            state=_padded(_ordered(state, order), belief.state),
-            covariance=_padded(_ordered(covariance, order), belief.covariance),
-            considered=_padded(_ordered(_columns(after.considered, k), order), belief.considered),
-            memory=_padded(_ordered(_columns(after.memory, k), order), belief.memory),
+            log_weights=pad(log_weights, (0, slots - k), value=-torch.inf),
+            state=kept(state),
+            covariance=kept(covariance),
+            considered=kept(_columns(after.considered, k)),
+            memory=kept(_columns(after.memory, k)),
             step=belief.step + 1,
         )
         return now, self._estimate(now)
@@ -195,12 +204,9 @@ class MultiHypothesisEkf(Localizer[HypothesesBelief]):
         """Mean and covariance of the position over all hypotheses."""
         d = self.process.dim
         weight = belief.log_weights.exp().unsqueeze(-1)
-        gone = weight == 0
-        state = belief.state[..., : 2 * d].masked_fill(gone, 0.0)
-        p = belief.covariance[..., :d, :d].masked_fill(gone.unsqueeze(-1), 0.0)
-        mean = (weight * state).sum(2)
-        apart = state[..., :d] - mean[..., None, :d]
-        own = (weight.unsqueeze(-1) * p).sum(2)
+        mean = (weight * belief.state[..., : 2 * d]).sum(2)
+        apart = belief.state[..., :d] - mean[..., None, :d]
+        own = (weight.unsqueeze(-1) * belief.covariance[..., :d, :d]).sum(2)
         return build(
             Estimate,
             belief.step.shape,
@@ -229,7 +235,8 @@ def _ordered(x: Float[Tensor, "B N k *s"], order: Int64[Tensor, "B N k"]) -> Ten
     return x.gather(2, wide)
 
 
-def _padded(x: Tensor, like: Tensor, value: float | None = None) -> Tensor:
-    """With what is no longer computed: as it was, or a ``value``."""
-    rest = like[:, :, x.shape[2] :]
-    return torch.cat((x, rest if value is None else torch.full_like(rest, value)), 2)
+def _in_slots(x: Tensor, gone: Bool[Tensor, "B N k"], slots: int) -> Tensor:
+    """With the likeliest in the places of those given up, and in slots that were not computed."""
+    first = x[:, :, :1]
+    live = torch.where(gone.reshape(*gone.shape, *[1] * (x.dim() - 3)), first, x)
+    return torch.cat((live, first.expand(-1, -1, slots - x.shape[2], *x.shape[3:])), 2)

@@ -35,20 +35,20 @@ def split(
     turn = e is not None and (process.any_yaw or prior.attitude_std > _TURN)
     ways = [*(_axes(x, process)[:2] if place else []), *([_vertical(x, process)] if turn else [])]
     flat = [*([uniform] * 2 if place else []), *([process.any_yaw] if turn else [])]
-    if not ways:
-        return x.unsqueeze(2), covariance.unsqueeze(2)
     k = min(count, _EACH ** len(ways))
+    if k <= max(1, len(ways)):  # too few to say anything about every direction
+        return x.unsqueeze(2), covariance.unsqueeze(2)
     share = k ** (-1 / len(ways))
     p = covariance
     delta = torch.zeros(*x.shape[:2], k, process.error_size, dtype=x.dtype, device=x.device)
-    for way, even, unit in zip(ways, flat, _spread(k, len(ways)).T.to(x.device), strict=True):
-        inside = (way.unsqueeze(-2) @ covariance @ way.unsqueeze(-1))[..., 0]  # σ², [B, N, 1]
-        at = math.sqrt(12) * (unit - 0.5) if even else math.sqrt(1 - share**2) * _normal(unit)
+    spread = _standardized(_spread(k, flat)).T.to(x.device) * math.sqrt(1 - share**2)
+    for way, at in zip(ways, spread, strict=True):
+        inside = ((covariance * way.unsqueeze(-2)).sum(-1) * way).sum(-1, keepdim=True)  # σ²
         delta = delta + (at * inside.sqrt()).unsqueeze(-1) * way.unsqueeze(2)
         less = (1 - share**2) * inside.unsqueeze(-1)
         p = p - less * way.unsqueeze(-1) * way.unsqueeze(-2)
-    at = process.boxplus(x.unsqueeze(2).expand(-1, -1, k, -1), delta)
-    return at, p.unsqueeze(2).expand(-1, -1, k, -1, -1)
+    states = process.boxplus(x.unsqueeze(2).expand(-1, -1, k, -1), delta)
+    return states, p.unsqueeze(2).expand(-1, -1, k, -1, -1)
 
 
 def _axes(x: Float64[Tensor, "B N S"], process: Process) -> list[Float64[Tensor, "B N E"]]:
@@ -66,17 +66,20 @@ def _vertical(x: Float64[Tensor, "B N S"], process: Process) -> Float64[Tensor, 
     return way
 
 
-def _spread(count: int, size: int) -> Float64[Tensor, "K D"]:
-    """Points that fill the unit cube evenly: the fractions of ½ + k (1/φ, 1/φ², …), φ being the
-    positive root of φ^(D+1) = φ + 1."""
-    phi = 2.0
+def _spread(count: int, even: list[bool]) -> Float64[Tensor, "K D"]:
+    """Points that fill space evenly, or as a normal distribution does: the fractions of
+    ½ + k (1/φ, 1/φ², …), φ being the positive root of φ^(D+1) = φ + 1, and their quantiles."""
+    phi, size = 2.0, len(even)
     for _ in range(60):
         phi = (1 + phi) ** (1 / (size + 1))
     steps = torch.arange(count, dtype=torch.float64).unsqueeze(-1)
     by = torch.tensor([phi ** -(i + 1) for i in range(size)], dtype=torch.float64)
-    return (0.5 + steps * by) % 1.0
+    unit = (0.5 + steps * by) % 1.0
+    return torch.where(torch.tensor(even), unit, torch.erfinv(2 * unit - 1))
 
 
-def _normal(unit: Float64[Tensor, "K"]) -> Float64[Tensor, "K"]:
-    """Quantiles of the normal distribution."""
-    return math.sqrt(2) * torch.erfinv(2 * unit - 1)
+def _standardized(t: Float64[Tensor, "K D"]) -> Float64[Tensor, "K D"]:
+    """The points with mean 0 and covariance I."""
+    t = t - t.mean(0)
+    root = torch.linalg.cholesky(t.T @ t / len(t))
+    return torch.linalg.solve_triangular(root, t.T, upper=False).T

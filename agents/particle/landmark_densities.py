@@ -28,7 +28,7 @@ def any_landmark_log_likelihood(
     """
     d = process.dim
     z = observation["unlabelled_landmarks"].unflatten(-1, (-1, d))
-    z, there = usable(z, observation["unlabelled_mask"] > 0)
+    z, there = usable(z, observation["unlabelled_landmark_mask"] > 0)
     z, there = _present(z, there)
     each = _log_densities(
         process, particles, centre, z, observation["landmark_map"], model.std, tails

@@ -26,7 +26,7 @@ from coloc_env.options import PositiveCount
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Sensor, UnmappedLandmarks
 
-Maps = Literal["team", "shared", "own"]
+Maps = Literal["shared", "own"]
 
 
 class MapBelief(TensorClass):
@@ -43,17 +43,17 @@ class MapBelief(TensorClass):
 
 
 class Slam(Localizer[MapBelief]):
-    """EKF-SLAM (Smith, Self & Cheeseman 1990; Durrant-Whyte & Bailey 2006) of UAVs and of landmarks
-    that can be told apart, in the frame of the UAVs' priors. Landmarks start uniform in the arena;
-    each update is a Gauss–Newton one of ``iterations``, about what was seen.
+    """EKF-SLAM (Smith, Self & Cheeseman 1990; Durrant-Whyte & Bailey 2006): each UAV has a filter
+    of its own state and of landmarks that can be told apart, in the frame of the UAVs' priors.
+    Landmarks start uniform in the arena; each update is a Gauss–Newton one of ``iterations``, about
+    where landmarks were seen.
 
-    ``maps=team``: one filter over all UAVs and one map, all ranges in it, whatever the network: the
-    reference. ``own``: each UAV has a filter and a map of its own, and ranges to where neighbours
-    say they are, as ``ekf`` has them. ``shared``: each has a filter and a map from its own sensors
-    alone, without ranges between UAVs, and sends the map's mean and covariance; what it receives is
-    added to its estimate, and never sent on or kept, so that nothing counts twice (DDF-SAM,
-    Cunningham, Paluri & Dellaert 2010). As maps are about what stands still, those that come late
-    are as good; what all of them start from is taken off.
+    ``maps=shared``: a UAV's filter uses its own sensors alone, without ranges between UAVs, and it
+    sends the mean and covariance of its map; what it receives is added to its estimate, and never
+    sent on or kept, so that nothing counts twice (DDF-SAM, Cunningham, Paluri & Dellaert 2010). As
+    maps are about what stands still, those that come late are as good; what all of them start from
+    is taken off. ``own``: maps stay where they are, and ranges to where neighbours say they are
+    join the filter, as ``ekf`` has them.
 
     ``robust=huber``: Huber's weights on all that is measured.
     """
@@ -65,28 +65,29 @@ class Slam(Localizer[MapBelief]):
         self,
         believed: Believed,
         *,
-        maps: Maps = "team",
+        maps: Maps = "shared",
         iterations: PositiveCount = 3,
         robust: Literal["none", "huber"] = "none",
     ) -> None:
         super().__init__(believed)
         sensor = believed.sensor(UnmappedLandmarks)
         if sensor is None:
-            raise NotServed("slam: the team has no landmarks to map (landmarks_known=false)")
-        if maps != "own" and believed.slots != believed.arena.n_uavs:
-            raise NotServed(f"slam: maps={maps} needs a slot for every UAV in each; maps=own not")
-        self.maps, self.iterations, self.robust = maps, iterations, robust == "huber"
+            raise NotServed("the team has no landmarks to map (landmarks_known=false)")
         self.process = make_process(believed)
         if self.process.attitude_error is None:
-            raise NotServed("slam: landmarks are in the body frame: the motion has no attitude")
+            raise NotServed("landmarks are in the body frame: the motion model has no attitude")
         self.vectors, self.count = LandmarkVectors(sensor.landmarks), sensor.landmarks.count
+        self.iterations, self.robust = iterations, robust == "huber"
+        self.shared = maps == "shared" and not self.centralized
+        if (self.shared or self.centralized) and believed.slots != believed.arena.n_uavs:
+            raise NotServed("each UAV needs a slot for every other, unless maps=own")
         models = make_measurements(believed)
-        self.models = [m for m in models if maps != "shared" or not m.cooperative]
+        self.models = [m for m in models if not (self.shared and m.cooperative)]
         self.age = 1 + believed.message_delay
 
     @property
     def exchanges(self) -> bool:
-        return self.maps != "own"
+        return self.shared or self.centralized
 
     def reset(self, observation: Observation) -> MapBelief:
         x, own = self.process.initial(observation["prior"].double())
@@ -94,13 +95,13 @@ class Slam(Localizer[MapBelief]):
         low, high = (x.new_tensor(side) for side in (self.believed.arena.low, self._high))
         landmarks = (0.5 * (low + high)).expand(b, n, self.count, d)
         size = self.count * d
-        width = (n if self.maps == "team" else 1) * e + size
+        width = (n if self.centralized else 1) * e + size
         covariance = x.new_zeros(b, n, e + size, width)
         for i in range(n):
-            first = i * e if self.maps == "team" else 0
+            first = i * e if self.centralized else 0
             covariance[:, i, :e, first : first + e] = own[:, i]
         covariance[..., e:, -size:] = self._unknown(x).diag()
-        sent = size + size**2 if self.maps == "shared" else 0
+        sent = size + size**2 if self.shared else 0
         return MapBelief(
             state=x,
             landmarks=landmarks.clone(),
@@ -113,7 +114,7 @@ class Slam(Localizer[MapBelief]):
 
     def step(self, belief: MapBelief, observation: Observation) -> tuple[MapBelief, Estimate]:
         n = belief.state.shape[1]
-        shape = (1, n) if self.maps == "team" else (n, 1)
+        shape = (1, n) if self.centralized else (n, 1)
         dt = elapsed(self.process, belief.step).double().unflatten(1, shape)
         u = self.process.inputs(observation).expand(*belief.step.shape, -1).unflatten(1, shape)
         prior = self._joint(belief, shape).predicted(self.process, u, dt)
@@ -125,11 +126,11 @@ class Slam(Localizer[MapBelief]):
         each = n // shape[0]
         rest = rest.repeat_interleave(each, 1)
         seen = self.vectors.read(observation, self.process.dim)[1]
-        if self.maps == "team":
+        if self.centralized:
             seen = seen.any(1, keepdim=True).expand_as(seen)
         state, own = x, self._own(rows)
         sent = belief.sent
-        if self.maps == "shared":
+        if self.shared:
             message = torch.cat((landmarks.flatten(-2), after.mapped.flatten(-2)), -1)
             state, own = self._fused(after, belief.sent[:, :, 0], observation)
             sent = torch.cat((sent[:, :, 1:], message.unsqueeze(2)), 2)
@@ -175,7 +176,7 @@ class Slam(Localizer[MapBelief]):
     def _own(self, rows: Float64[Tensor, "B N E M"]) -> Float64[Tensor, "B N E E"]:
         """Each UAV's own block of its rows."""
         n, e = rows.shape[1:3]
-        if self.maps != "team":
+        if not self.centralized:
             return rows[..., :e]
         split = rows[..., : n * e].unflatten(-1, (n, e))
         return split.diagonal(dim1=1, dim2=3).movedim(-1, 1)
@@ -220,7 +221,7 @@ class Slam(Localizer[MapBelief]):
         return delta
 
     def _neighbours(self, x: Float64[Tensor, "B N S"], observation: Observation) -> Neighbours:
-        if self.maps != "team":
+        if not self.centralized:
             return received(self.believed, observation)
         b, n, d = *x.shape[:2], self.process.dim
         place = x[:, None, :, :d].expand(b, n, n, d)

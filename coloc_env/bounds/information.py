@@ -233,11 +233,9 @@ def _uav_bearings(
     sensor: UavBearings, truth: Kinematics, seen: Observation
 ) -> Float64[Tensor, "B N D N D"]:
     """Range and bearing of R_iᵀ(p_j − p_i), each end measuring for itself."""
-    weights = _seen_of_others(seen, "uav_bearing_mask", sensor.depth)
+    weights = seen_of_others(seen, "uav_bearing_mask", sensor.depth)
     apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, len(weights[0]), -1, -1))
-    return _of_directions(
-        _polar_jacobian(apart, sensor.range_std, sensor.bearing_std) @ own, weights
-    )
+    return between(_polar_jacobian(apart, sensor.range_std, sensor.bearing_std) @ own, weights)
 
 
 @shared_information.register
@@ -245,16 +243,17 @@ def _arrival_angles(
     sensor: ArrivalAngles, truth: Kinematics, seen: Observation
 ) -> Float64[Tensor, "B N D N D"]:
     """Azimuth and elevation of R_iᵀ(p_j − p_i), each end measuring for itself."""
-    weights = _seen_of_others(seen, "arrival_angle_mask", sensor.depth)
+    weights = seen_of_others(seen, "arrival_angle_mask", sensor.depth)
     apart, own = _relative(truth, truth.position.unsqueeze(1).expand(-1, len(weights[0]), -1, -1))
     std = own.new_tensor((sensor.azimuth_std, sensor.elevation_std)).clamp_min(EXACT)
-    return _of_directions(angles_by_vector(apart) / std.unsqueeze(-1) @ own, weights)
+    return between(angles_by_vector(apart) / std.unsqueeze(-1) @ own, weights)
 
 
-def _of_directions(
+def between(
     own: Float64[Tensor, "B N N k D"], weights: Float64[Tensor, "B N N"]
 ) -> Float64[Tensor, "B N D N D"]:
-    """Information of what depends on R_iᵀ(p_j − p_i), by its derivatives by i's pose."""
+    """Information of what depends on p_j − p_i and the attitude of i, such as R_iᵀ(p_j − p_i), by
+    its derivatives by i's pose."""
     d = 3 if own.shape[-1] == 6 else 2
     other = torch.zeros_like(own)
     other[..., :d] = -own[..., :d]  # only p_j − p_i matters, and the other's attitude not at all
@@ -265,7 +264,7 @@ def _of_directions(
     return joint
 
 
-def _seen_of_others(seen: Observation, mask: str, depth: int) -> Float64[Tensor, "B N N"]:
+def seen_of_others(seen: Observation, mask: str, depth: int) -> Float64[Tensor, "B N N"]:
     """How often each UAV measured each other one."""
     arrived = _mask(seen, mask).unflatten(-1, (depth, -1)).sum(-2)
     return _by_uav(arrived.unsqueeze(-1), seen).squeeze(-1)

@@ -12,12 +12,17 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from coloc_env.bounds.information import own_information
+from coloc_env.bounds.information import (
+    between,
+    own_information,
+    seen_of_others,
+    shared_information,
+)
 from coloc_env.bounds.mixture import EXACT
 from coloc_env.geometry import cross_matrix, rotation_matrix
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
-from coloc_env.sensors import Compass, Light, Magnetic, Rssi, Ultrasonic
+from coloc_env.sensors import Compass, Light, Magnetic, Rssi, UavRssi, Ultrasonic
 from coloc_env.sensors.compass import heading
 
 
@@ -34,9 +39,22 @@ def _rssi(sensor: Rssi, truth: Kinematics, seen: Observation) -> Float64[Tensor,
     """z = P₀ − 10 n log₁₀ ‖p − A‖ − losses + N(0, σ²)."""
     d = truth.position.shape[-1]
     points = seen["rssi_map"].double().unflatten(-1, (-1, d))
-    _, gradient = sensor.expected(truth.position.unsqueeze(-2), points)
+    _, gradient = sensor.loss.expected(truth.position.unsqueeze(-2), points)
     rows = torch.nn.functional.pad(gradient, (0, 3 if d == 3 else 1))
-    return _gram(rows, seen["rssi_mask"].double() / max(sensor.std, EXACT) ** 2)
+    return _gram(rows, seen["rssi_mask"].double() / max(sensor.loss.std, EXACT) ** 2)
+
+
+@shared_information.register
+def _uav_rssi(
+    sensor: UavRssi, truth: Kinematics, seen: Observation
+) -> Float64[Tensor, "B N D N D"]:
+    """The same of other UAVs, each end measuring for itself."""
+    d, n = truth.position.shape[-1], truth.position.shape[1]
+    others = truth.position.unsqueeze(1).expand(-1, n, -1, -1)
+    _, gradient = sensor.loss.expected(truth.position.unsqueeze(-2), others)
+    rows = torch.nn.functional.pad(gradient, (0, 3 if d == 3 else 1)).unsqueeze(-2)
+    weights = seen_of_others(seen, "uav_rssi_mask", 1) / max(sensor.loss.std, EXACT) ** 2
+    return between(rows, weights)
 
 
 @own_information.register

@@ -24,7 +24,7 @@ from coloc_env.scenario import (
     Scenario,
     TeamOptions,
 )
-from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, access_points
+from coloc_env.scenarios.parts.anchors import AnchorOptions, TdoaOptions, signal_strengths
 from coloc_env.sensors import (
     AngleOptions,
     BarometerOptions,
@@ -115,12 +115,11 @@ def indoor(
     true += tdoa.true(room, arms)
     believed += tdoa.believed(room, arms)
     others = (*angles.true, *gnss.true(team.n_uavs), *flow.true, *barometer.true)
-    senses = (
-        *(*compass.true, *light.true(room, radio.walls), *access_points(rssi, room, radio.walls)),
-        *(*ultrasonic.true(room, radio.walls), *magnetic.true(room)),
-    )
-    true += (*others, *senses)
-    believed += (*others, *senses)
+    senses = (*compass.true, *light.true(room, inside), *magnetic.true(room))
+    others += (*senses, *signal_strengths(rssi, room, radio.walls))
+    others += ultrasonic.true(room, radio.walls)
+    true += others
+    believed += others
     return Scenario(
         name="indoor-v0",
         arena=arena,

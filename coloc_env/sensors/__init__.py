@@ -19,7 +19,7 @@ from coloc_env.sensors.position_fix import AnchorUavOptions, GnssOptions, Positi
 from coloc_env.sensors.ranging import AnchorRanging, Ranging, TagOptions, UavRangeOptions
 from coloc_env.sensors.reference import Reference
 from coloc_env.sensors.relative_pose import RecordedPoses, RelativePose, RelativePoseOptions
-from coloc_env.sensors.rssi import Rssi, RssiOptions
+from coloc_env.sensors.rssi import PathLoss, Rssi, RssiOptions, UavRssi
 from coloc_env.sensors.sight import Sight, SightOptions
 from coloc_env.sensors.slow_flight import SlowFlight
 from coloc_env.sensors.tdoa import Tdoa
@@ -58,6 +58,7 @@ __all__ = [
     "NlosKind",
     "Odometry",
     "OpticalFlow",
+    "PathLoss",
     "PositionFix",
     "RangeNoise",
     "RangeOptions",
@@ -80,6 +81,7 @@ __all__ = [
     "Tdoa",
     "UavBearings",
     "UavRangeOptions",
+    "UavRssi",
     "Ultrasonic",
     "UltrasonicOptions",
     "UnlabelledLandmarks",

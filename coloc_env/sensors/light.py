@@ -1,7 +1,7 @@
 """Lamps at known places on the ceiling: how bright each is, and in which direction."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 import torch
@@ -10,10 +10,9 @@ from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.geometry import cross, unrotate
-from coloc_env.geometry.walls import depth
-from coloc_env.motion import Box
 from coloc_env.options import Group, PositiveCount, PositiveMetres, Quantity, Radians, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
+from coloc_env.sensors.sight import Sight
 
 _SIZE = 0.1  # m²: a lamp is no point
 Lux = Annotated[float, Quantity("lx", 0.0)]
@@ -29,8 +28,8 @@ class Light(Sensor):
     Intensity is I = I₀ cos θ / (r² + 0.1) + ``ambient``, θ the angle from straight below, with
     Gaussian noise of variance (``share`` I)² + ``floor``². Directions u to lamps are scattered as
     von Mises and Fisher have it, with κ = 1 / ``angle_std``² (rad): N(0, ``angle_std``² I) across u
-    where that is small. Lamps within ``radius`` m are seen, from below and where none of the
-    ``walls`` is between.
+    where that is small. Lamps within ``radius`` m are seen, from below and where nothing of the
+    ``sight`` is between.
     """
 
     lamps: tuple[tuple[float, ...], ...]
@@ -40,7 +39,7 @@ class Light(Sensor):
     floor: float = 0.5
     angle_std: float = 0.05
     radius: float = 10.0
-    walls: tuple[Box, ...] = ()
+    sight: Sight = field(default_factory=Sight)
 
     def __post_init__(self) -> None:
         require(len(self.lamps) >= 1, self, "lamps", "at least one lamp")
@@ -97,8 +96,8 @@ class Light(Sensor):
         exact, _ = self.intensity(apart)
         seen = window.alive.unsqueeze(-1) & (apart[..., 2] > 0)
         seen = seen & (squared_norm(apart) <= self.radius**2)
-        if self.walls:
-            seen = seen & ~(depth(own, lamps, self.walls) > 0)
+        if not self.sight.clear:
+            seen = seen & (self.sight.between(window, own, lamps) == 0)
         n, count = exact.shape[-2:]
         white = noise.normal(window.keys, "light", n * count).unflatten(-1, (n, count))
         measured = exact.to(torch.float32) + self.variance(exact).sqrt().to(torch.float32) * white
@@ -153,7 +152,7 @@ class LightOptions(Group):
     """With ``light``, UAVs see so many ``lamps``, evenly on the ceiling, within ``light_radius`` m:
     how bright each is (``lamp_power`` lx at 1 m straight below, with ``light_ambient`` lx of other
     light), with noise of a share ``light_share`` and a floor of ``light_floor`` lx, and its
-    direction (body frame), to ``light_angle_std`` rad. The network's ``walls`` hide lamps."""
+    direction (body frame), to ``light_angle_std`` rad. Walls and obstacles hide lamps."""
 
     title: ClassVar[str] = "lamps"
 
@@ -166,10 +165,11 @@ class LightOptions(Group):
     light_angle_std: Radians = 0.05
     light_radius: PositiveMetres = 10.0
 
-    def true(self, room: tuple[float, ...], walls: tuple[Box, ...] = ()) -> tuple[Light, ...]:
-        """The sensor as it is, in a room with sides in m; nothing without light."""
+    def true(self, room: tuple[float, ...], sight: Sight) -> tuple[Light, ...]:
+        """The sensor as it is, in a room with sides in m and what stands in it; nothing without
+        light."""
         if not self.light:
             return ()
         own = (self.lamp_power, self.light_ambient, self.light_share, self.light_floor)
-        seen = (self.light_angle_std, self.light_radius, walls)
+        seen = (self.light_angle_std, self.light_radius, sight)
         return (Light(lamp_places(self.lamps, room), *own, *seen),)

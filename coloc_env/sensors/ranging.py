@@ -116,7 +116,8 @@ class Ranging(Sensor):
         out = by_pair(self.noise.out(window, pairs, "ranging", self.latency))
         bias = by_pair(self.noise.biases(window, pairs, "ranging", self.latency))
         blocked, through = None, None
-        own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
+        if self.walls or not self.sight.clear:
+            own, theirs = tags.unsqueeze(3).unsqueeze(-2), in_slots(tags, others).unsqueeze(-3)
         if self.walls:
             inside = depth(own, theirs, self.walls).to(torch.float32)
             blocked = inside > 0

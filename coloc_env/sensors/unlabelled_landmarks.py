@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnlabelledLandmarks(Sensor):
-    """Leaves ``unlabelled_landmarks`` [L · d], ``unlabelled_mask`` [L], ``landmark_map`` [L · d].
+    """Leaves ``unlabelled_landmarks`` [L · d] with ``unlabelled_landmark_mask`` [L], and the map,
+    ``landmark_map`` [L · d].
 
     What ``labelled`` landmarks give (vectors in the body frame, m), in an order that is drawn for
     every UAV and step: entry m is that of any landmark of the map.
@@ -34,7 +35,7 @@ class UnlabelledLandmarks(Sensor):
         vectors = self.labelled.leaves(layout)["landmarks"]
         return {
             "unlabelled_landmarks": vectors,
-            "unlabelled_mask": Leaf(self.labelled.count, *MASK),
+            "unlabelled_landmark_mask": Leaf(self.labelled.count, *MASK),
         }
 
     def map_leaves(self, layout: Layout) -> dict[str, Leaf]:
@@ -54,4 +55,4 @@ class UnlabelledLandmarks(Sensor):
         vectors = seen["landmarks"].unflatten(-1, (count, -1))
         shuffled = vectors.gather(-2, order.unsqueeze(-1).expand_as(vectors))
         mask = seen["landmark_mask"].gather(-1, order)
-        return {"unlabelled_landmarks": shuffled.flatten(-2), "unlabelled_mask": mask}
+        return {"unlabelled_landmarks": shuffled.flatten(-2), "unlabelled_landmark_mask": mask}

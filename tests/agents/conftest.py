@@ -82,6 +82,8 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "sight_few": indoor(uwb=False, landmarks=4),
     "sight_uniform": indoor(uwb=False, prior="uniform"),
     "sight_bias": indoor(uwb=False, imu_bias=True, n_uavs=20),
+    "unnamed": indoor(association="unknown"),
+    "any_yaw": indoor(prior_yaw="uniform"),
     "unmapped": indoor(landmarks=6, landmarks_known=False, anchors=4, n_uavs=3),
     "plane": plane,
     "tags": tags,
@@ -98,6 +100,9 @@ VARIANTS = (
     "ekf:robust=ransac",
     "ekf:robust=temporal",
     "ekf:robust=cross",
+    "ekf:robust=student",
+    "ekf:robust=mixture",
+    "pf500:likelihood=student",
     f"ekf:robust={ALL}:fusion=ci",
     f"ekf_joint:robust={ALL}",
     "ekf:fusion=ci",
@@ -129,6 +134,7 @@ CHOSEN = {
     "dfgo_central": ("default", "imu_bias", "plane"),
     "dlspf": ("default", "uniform", "imu_bias", "anchors", "slots", "tags"),
     "ukf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "tags"),
+    "mhekf": ("default", "uniform", "imu_bias", "anchors", "slots", "plane", "unnamed", "any_yaw"),
     "emvf": ("few", "anchors", "plane", "tags", "wsn"),
     "hpff": ("anchors", "wsn"),
     "nnhpff": ("anchors", "tags"),
@@ -141,13 +147,15 @@ CHOSEN = {
     "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
     **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
-    "slam": ("unmapped",),
+    **dict.fromkeys(("slam", "slam_central"), ("unmapped",)),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
 SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
 SPECIAL = (
     *SPECIAL,
     "unmapped",
+    "unnamed",
+    "any_yaw",
     "late",
     "biased",
     "sight",
@@ -163,11 +171,14 @@ CASES = [
     *((f"ekf:fusion={f}", "tags") for f in ("ci", "pairwise", "exchange")),
     *((f"ekf:fusion={f}", "late") for f in ("ci", "pairwise", "exchange")),
     *((n, "wsn") for n in ("pf", "ekf")),
+    *((n, "unnamed") for n in ("ekf", "ekf:association=nearest", "apf", "ekf:robust=temporal")),
+    *((n, "any_yaw") for n in ("ekf", "apf", "ukf")),
+    *((n, "unnamed") for n in ("pf500", "pf500:association=joint", "pf_trust", "ekf_trust")),
     *((n, "biased") for n in ("ekf", "ekf_joint", "ekf:fusion=pairwise")),
     *((n, "swarm") for n in ("ekf", "pf", "ekf:robust=huber")),
     *((f"cspf:{o}", "stein2d") for o in ("broadcast=true", "variant=neighbourhood")),
     *(("stdcl:variant=calibrated", f) for f in ("swarm", "campus")),
-    *((f"slam:maps={m}", "unmapped") for m in ("own", "shared")),
+    ("slam:maps=own", "unmapped"),
     *((n, "slots") for n in ("ekf:robust=temporal", "ekf:robust=cross")),
 ]
 CASES = [case for case in CASES if case not in REFUSED]
@@ -229,7 +240,8 @@ def room(name: str, **overrides: Any) -> Scenario:
     if name in ("stdcl", "stgat"):
         return make_scenario("swarm-v0", **{"n_uavs": 6, **overrides})
     if "unmapped" in chosen:
-        return make_scenario("indoor-v0", landmarks_known=False, **overrides)
+        few = {"landmarks_known": False, "landmarks": 6, "anchors": 4}
+        return make_scenario("indoor-v0", **few, **overrides)
     if "sight" in chosen:
         return make_scenario("indoor-v0", uwb=False, **overrides)
     among: dict[str, Any] = {} if "default" in chosen else {"anchors": 8, "landmarks": 0}

@@ -116,10 +116,11 @@ def test_a_row_of_a_batch_is_its_own_run(sample: SimpleNamespace, tools: SimpleN
 
 @pytest.mark.parametrize("name", LOCALIZERS)
 def test_rows_do_not_depend_on_how_many_there_are(name: str, tools: SimpleNamespace) -> None:
-    """Hybrids hold a Kalman filter among anchors, whose last row of many is an ulp off."""
+    """Hybrids hold a Kalman filter among anchors, whose last row of many is an ulp off; so are
+    products of matrices as large as a map's."""
     scenario = tools.room(name)
     localizer = tools.build(name, scenario)
-    tolerance = SUMMED if localizer.centralized or name in ("hpff", "nnhpff") else EXACT
+    tolerance = SUMMED if localizer.centralized or name in ("hpff", "nnhpff", "slam") else EXACT
     many = tools.play(localizer, scenario, range(70), 3)
     for seed in (0, 69):
         alone = tools.play(localizer, scenario, [seed], 3)
@@ -133,7 +134,7 @@ def test_a_row_of_a_small_team_is_its_own_run(
     """Also where a team has one pair of UAVs, or one UAV and no neighbours at all."""
     scenario = tools.room(name, n_uavs=n_uavs)
     localizer = tools.build(name, scenario)
-    tolerance = SUMMED if localizer.centralized else EXACT
+    tolerance = SUMMED if localizer.centralized or name == "slam" else EXACT
     many = tools.play(localizer, scenario, range(3), 4)
     for seed in (0, 2):
         alone = tools.play(localizer, scenario, [seed], 4)

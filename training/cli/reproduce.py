@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from training.cli.options import Data, Device, Jobs, Ray, Seed, require_seed, workers_of
+from training.cli.options import (
+    Data,
+    Device,
+    Jobs,
+    Ray,
+    Seed,
+    require_device,
+    require_seed,
+    workers_of,
+)
 from training.cli.terminal import progress
 from training.threads import use_threads
 
@@ -93,13 +102,12 @@ def reproduce(
         os.environ["COLOC_DATA"] = str(data)
     require_seed(seed)
     use_threads(1)
-    from training.devices import checked_device
     from training.evaluation.evaluate import split_agents
     from training.reproduce.settings import Settings
     from training.reproduce.study import STUDIES
     from training.reproduce.study import reproduce as run
 
-    checked_device(device)
+    require_device(device, jobs, ray)
     chosen = STUDIES.require(study)()
     with workers_of(jobs, ray) as workers, progress() as bars:
         settings = Settings(

@@ -14,12 +14,15 @@ from torchrl.objectives import LossModule
 from torchrl.trainers import Trainer
 
 from agents import make
+from agents.kalman.filter import elapsed
+from agents.models.process import make_process
 from agents.particle import particle_count
 from agents.particle.cloud import select
 from agents.particle.corrector import motion_features
 from agents.policies.adapters import LocalizerPolicy
 from coloc_env import noise
 from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.observation import Observation, all_leaves
 from coloc_env.options import Factor, PositiveCount
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
@@ -35,12 +38,15 @@ from training.learning.collectors import (
     episode_collector,
     world_seed,
 )
+from training.learning.labels import Labels, labels_of
 from training.learning.replay_buffer import replay_buffer_trainer
 from training.learning.run import Progress, Training, make_trainer
 
 EVERY = 10  # steps between trainings (section 2.3)
 PARTICLES = 50  # of each UAV that one training looks at (section 3.3.2)
 LEARNING_RATE = 0.01
+LabelName = Literal["truth", "calibration", "self_supervised", "prediction", "contrastive"]
+LATE = ("calibration", "self_supervised")  # which only later steps give
 
 
 class CorrectorLoss(LossModule):
@@ -75,29 +81,84 @@ class Samples:
     """What the filter records for training, as a ``LocalizerPolicy``'s ``record``.
 
     Of ``size`` random particles of each UAV: ``features`` [B, N, P, 6] (equation 11), ``target``
-    [B, N, P] and ``mask``; and of the filter itself ``error`` (m) and ``count`` [B, N].
+    [B, N, P] and ``mask``; and of the filter itself ``error`` (m) and ``count`` [B, N], which no
+    loss sees. The target is exp(−‖p − p̃‖), p̃ being the truth, ``late``'s labels, or the
+    ``prediction``, the last estimate moved on at its velocity; or (``contrastive``) 1 for a
+    displacement since the last step that fits the IMU, 0 for another UAV's particle's.
     """
 
-    def __init__(self, scenario: Scenario, size: int = PARTICLES) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        size: int = PARTICLES,
+        labels: LabelName = "truth",
+        late: Labels | None = None,
+    ) -> None:
         self.dim, self.n_uavs, self.size = scenario.arena.dim, scenario.arena.n_uavs, size
+        self.labels, self.late, self.scenario = labels, late, scenario
+        self.process = make_process(scenario.believed)
 
     def __call__(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
         d = self.dim
         state = tensordict["state"].unflatten(-1, (self.n_uavs, -1))
-        truth, scored = state[..., :d], state[..., -1:] > 0
-        m = after.particles.shape[-2]
-        alive = particle_count.alive(after.count, m)
+        truth, scored = state[..., :d], state[..., -1] > 0
+        if self.labels == "contrastive":
+            samples = self._contrasted(before, after, tensordict)
+        else:
+            chosen, alive = self._chosen(after, after)
+            particles = select(after.particles, chosen)
+            where, there = truth, scored
+            if self.labels != "truth":
+                where, there = self._without_truth(before, tensordict)
+            distance = (particles[..., :d] - where.unsqueeze(-2)).norm(dim=-1)
+            samples = {
+                "features": motion_features(particles, before.last, d),
+                "target": torch.exp(-distance),
+                "mask": alive & there.unsqueeze(-1),
+            }
+        return {
+            **samples,
+            "error": (tensordict["uav", "action"][..., :d] - truth).norm(dim=-1),
+            "scored": scored,
+            "count": after.count,
+        }
+
+    def _chosen(self, cloud: Any, after: Any) -> tuple[Tensor, Tensor]:
+        """Indices of random live particles of a cloud [B, N, P], and which of them are alive."""
+        m = cloud.particles.shape[-2]
+        alive = particle_count.alive(cloud.count, m)
         draws = noise.uniform(noise.fold(after.key, after.step), "train.particles", m)
         chosen = draws.masked_fill(~alive, 2.0).topk(self.size, -1, largest=False).indices
-        particles = select(after.particles, chosen)
-        distance = (particles[..., :d] - truth.unsqueeze(-2)).norm(dim=-1)
+        return chosen, alive.gather(-1, chosen)
+
+    def _without_truth(self, before: Any, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """p̃ [B, N, d], and where it counts."""
+        d, there = self.dim, tensordict["uav", "mask"]
+        if self.late is None:
+            return before.last[..., :d] + self.process.dt * before.last[..., d:], there
+        where, known = self.late.at(int(before.step.flatten()[0]))
+        return where.to(before.last), there & known
+
+    def _contrasted(
+        self, before: Any, after: Any, tensordict: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """The particles before the step moved by the IMU, half of them by what moved a particle of
+        the next UAV."""
+        d, half = self.dim, self.size // 2
+        seen = tensordict["uav", "observation"]
+        observation = Observation({name: seen[name] for name in all_leaves(self.scenario)})
+        u = self.process.inputs(observation).to(torch.float32).unsqueeze(-2)
+        dt = elapsed(self.process, before.step).to(torch.float32).unsqueeze(-1)
+        chosen, alive = self._chosen(before, after)
+        first = select(before.particles, chosen)
+        moved = (self.process.propagate(first, u, dt) - first)[..., : 2 * d]
+        shuffled = moved.roll((1, half), (1, 2))
+        fits = torch.arange(self.size, device=moved.device) < half
+        ends = first[..., : 2 * d] + torch.where(fits[:, None], moved, shuffled)
         return {
-            "features": motion_features(particles, before.last, d),
-            "target": torch.exp(-distance),
-            "mask": alive.gather(-1, chosen) & scored,
-            "error": (tensordict["uav", "action"][..., :d] - truth).norm(dim=-1),
-            "scored": scored[..., 0],
-            "count": after.count,
+            "features": motion_features(ends, before.last, d),
+            "target": fits.to(ends).expand(ends.shape[:-1]).clone(),
+            "mask": alive & tensordict["uav", "mask"].unsqueeze(-1),
         }
 
 
@@ -125,6 +186,8 @@ def pfnn(
     device: str = "cpu",
     *,
     mode: Literal["offline", "online"] = "offline",
+    labels: LabelName = "truth",
+    start: str = "none",
     scenario: str = "indoor-v0",
     worlds: Worlds = 8,
     epochs: Epochs = 20,
@@ -134,12 +197,19 @@ def pfnn(
     seed: Seed = 0,
     score_runs: ScoreRuns = 10,
 ) -> Training:
-    """The PF-NN paper's weight corrector, from the simulator's truth (equations 11 to 16).
+    """The PF-NN paper's weight corrector (equations 11 to 16).
 
     In every epoch the filter runs in new worlds with its newest weights. With ``mode=offline`` it
     learns after the episode, from a replay buffer of the episode's particles, in several passes.
     ``mode=online`` is the paper's way: every 10 steps a step of gradient descent on each UAV's
     particles in turn, which the filter uses at once (no ``passes``, no ``minibatch``).
+
+    ``labels``: the ``truth`` (of the simulator, or a recording's); or, without any truth,
+    ``calibration``, trilateration from anchors averaged over ± 5 steps; ``self_supervised``,
+    ``dfgo``'s smoothed window a second later, UAVs tied by landmarks that they see in common;
+    ``prediction``, the motion model's, at a tenth of the ``learning_rate`` (the paper's online
+    phase); ``contrastive``, displacements that fit the IMU against other particles'.
+    ``start``: the checkpoint whose weights it starts from (``none``: random ones).
 
     The ``scenario`` takes overrides: ``indoor-v0:motion=random:horizon=300``. At the end ``apf``
     and ``pfnn`` are compared in ``score_runs`` held-out worlds of it.
@@ -149,13 +219,20 @@ def pfnn(
         raise ValueError(
             f"pfnn: a horizon of {parsed.horizon} steps is too short: {EVERY} at least"
         )
-    localizer: Any = make("pfnn", parsed, weights="none", seed=seed).to(device)
+    if labels in LATE and mode == "online":
+        raise ValueError(f"pfnn: labels={labels} is not allowed with mode=online: known too late")
+    if labels == "prediction":
+        learning_rate *= 0.1
+    localizer: Any = make("pfnn", parsed, weights=start, seed=seed).to(device)
     loss = CorrectorLoss(localizer.corrector)
     steps = EVERY if mode == "online" else parsed.horizon // EVERY * EVERY
 
     def collect(epoch: int) -> Batches:
-        policy = LocalizerPolicy(localizer, parsed, record=Samples(parsed))
-        env = CoLocEnv(parsed, worlds, device, seed=world_seed(seed, epoch, worlds))
+        first = world_seed(seed, epoch, worlds)
+        late = labels_of(labels, parsed, worlds, first, device) if labels in LATE else None
+        samples = Samples(parsed, labels=labels, late=late)
+        policy = LocalizerPolicy(localizer, parsed, record=samples)
+        env = CoLocEnv(parsed, worlds, device, seed=first)
         return episode_collector(env, policy, steps, compact_obs=True)
 
     collector = EpochCollector(collect, epochs)

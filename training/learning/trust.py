@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from agents.robust import Capped
 from agents.trust import TrustNetwork
 from agents.weights import learned, untrained
 from coloc_env.envs.torchrl import CoLocEnv
+from coloc_env.motion.recorded import RecordedMotion
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.options import Factor
 from coloc_env.scenario import Scenario
@@ -38,6 +39,8 @@ from training.learning.collectors import (
     require_batches,
     world_seed,
 )
+from training.learning.labels import Labels, smoothed
+from training.learning.left_out import Watched
 from training.learning.run import Progress, Training, make_trainer
 
 # What the networks meet: each difficulty alone, all at once, nothing at all; and ranges unlike
@@ -61,6 +64,7 @@ VARIANTS = (
     "landmarks=5:uwb_tail=0.1:uwb_impulse=0.01:believed_uwb_std=0.15:uwb_dropout=0.2:horizon=200",
 )
 SCORED = ("", "nlos=0.3", "false_matches=0.1", "landmarks=5:nlos=0.3:false_matches=0.1")
+LabelName = Literal["truth", "left_out", "self_supervised"]
 _SOFT = 20.0  # Mahalanobis² beyond which a lost UAV's loss grows like its logarithm only
 
 
@@ -77,7 +81,8 @@ def negative_log_likelihood(
 
 
 class TrustLoss(LossModule):
-    """Mean negative log-likelihood of the positions over a batch's steps.
+    """Mean negative log-likelihood over a batch's steps: of the positions, true ones or
+    ``self_supervised`` labels; or (``left_out``) of all that was measured, each left out.
 
     The EKF is run again over the batch [B, T], from the belief that its first step started
     from and on the observations that were made, this time with gradients: truncated backpropagation
@@ -92,35 +97,57 @@ class TrustLoss(LossModule):
         network: TrustNetwork,
         filters: Sequence[CooperativeEkf],
         scenarios: Sequence[Scenario],
+        labels: LabelName = "truth",
     ) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.labels = network, labels
         self.filters, self.scenarios = tuple(filters), tuple(scenarios)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         train = tensordict["train"]
         variant = int(train["variant"][0, 0])
         ekf, scenario = self.filters[variant], self.scenarios[variant]
-        n, d = scenario.arena.n_uavs, scenario.arena.dim
-        state = tensordict["state"].unflatten(-1, (n, -1)).double()
+        if self.labels == "truth":
+            state = tensordict["state"].unflatten(-1, (scenario.arena.n_uavs, -1)).double()
+            where, scored = state[..., : scenario.arena.dim], state[..., -1] > 0
+        elif self.labels == "self_supervised":
+            where, scored = train["label"], train["known"] & tensordict["uav", "mask"]
+        else:
+            where, scored = None, tensordict["uav", "mask"]
         belief = _belief(train[:, 0])
-        losses = []
+        losses, counts = [], []
         for t in range(tensordict.shape[1]):
             seen = tensordict["uav", "observation"][:, t]
             observation = Observation({name: seen[name] for name in all_leaves(scenario)})
             belief, estimate = ekf.step(belief, observation)
-            offset = estimate.position - state[:, t, :, :d]
-            losses.append(negative_log_likelihood(offset, estimate.covariance))
-        scored = state[..., -1].movedim(1, 0) > 0
-        loss = torch.where(scored, torch.stack(losses), 0.0).sum() / scored.sum()
-        return TensorDict({"loss_trust": loss})
+            if where is None:
+                loss, count = ekf.screen.surprise(belief.covariance)
+            else:
+                offset = estimate.position - where[:, t]
+                loss = negative_log_likelihood(offset, estimate.covariance)
+                count = torch.ones_like(loss)
+            losses.append(torch.where(scored[:, t], loss, 0.0))
+            counts.append(torch.where(scored[:, t], count, 0.0))
+        total = torch.stack(losses).sum() / torch.stack(counts).sum().clamp_min(1)
+        return TensorDict({"loss_trust": total})
 
 
-def _record(variant: int, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
-    """The belief that the learned filter's step starts from, and which scenario it is of."""
+def _record(
+    variant: int,
+    before: Any,
+    after: Any,
+    tensordict: TensorDictBase,
+    labels: Labels | None = None,
+) -> dict[str, Tensor]:
+    """The belief that the learned filter's step starts from, which scenario it is of, and its
+    labels if there are any."""
     if isinstance(before, BankBelief):
         before = learned_branch(before)
+    own: dict[str, Tensor] = {}
+    if labels is not None:
+        own["label"], own["known"] = labels.at(int(before.step.flatten()[0]))
     return {
+        **own,
         "state": before.state,
         "covariance": before.covariance,
         "considered": before.considered,
@@ -141,6 +168,8 @@ def trust(
     device: str = "cpu",
     *,
     scenario: str = "indoor-v0:horizon=100",
+    variants: str | None = None,
+    labels: LabelName = "truth",
     start: str = "trust",
     worlds: Worlds = 8,
     epochs: Epochs = 6,
@@ -156,22 +185,34 @@ def trust(
     NLOS, false matches, few landmarks, uniform prior, anchors alone, ranges unlike what is
     believed, combinations) are run with the newest weights, in turn by the filter alone and by its
     bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through
-    the learned filter. The learning rate falls linearly to a twentieth. ``start``: the checkpoint
+    the learned filter. ``variants``: overrides of ``scenario``, separated by slashes (none: those
+    above; a recording as it is). The learning rate falls linearly to a twentieth. ``start``: the checkpoint
     whose weights it starts from (``none``: random ones).
-    ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end.
+
+    ``labels``: the ``truth``; or, without any truth, ``left_out``, the likelihood of each
+    measurement predicted by all others and the past in place of the position's, or
+    ``self_supervised``, that of positions in ``dfgo``'s smoothed window a second later, UAVs tied
+    by landmarks that they see in common.
+
+    ``score_runs``: held-out worlds on which ``ekf_trust`` is compared to a Huber EKF at the end
+    (none on a recording).
     """
-    scenarios = [parse_scenario(scenario, variant) for variant in VARIANTS]
+    recorded = isinstance(parse_scenario(scenario).motion, RecordedMotion)
+    chosen = ("",) if recorded else VARIANTS
+    if variants is not None:
+        chosen = tuple(variants.split("/"))
+    scenarios = [parse_scenario(scenario, variant) for variant in chosen]
     require_batches("trust", scenarios, steps)
     network = _first(start, seed).to(device)
     filters: list[Any] = [make("ekf_trust:bank=false:weights=none", one) for one in scenarios]
     banks: list[Any] = [make("ekf_trust:weights=none", one) for one in scenarios]
     for ekf, bank in zip(filters, banks, strict=True):
         ekf.learn(network)
-        ekf.screen = Capped(ekf.screen)
+        ekf.screen = Watched(Capped(ekf.screen))
         bank.learn(network)
         ekf.to(device)
         bank.to(device)
-    loss = TrustLoss(network, filters, scenarios)
+    loss = TrustLoss(network, filters, scenarios, labels)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate)
 
     def collect(epoch: int) -> RoundRobin:
@@ -182,8 +223,12 @@ def trust(
         collectors = []
         team = banks if epoch % 2 else filters
         for i, (one, localizer) in enumerate(zip(scenarios, team, strict=True)):
+            known = None
+            if labels == "self_supervised":
+                known = smoothed(one, worlds, first + i * worlds, device)
             env = CoLocEnv(one, worlds, device, seed=first + i * worlds)
-            policy = LocalizerPolicy(localizer, one, record=partial(_record, i))
+            record_belief = partial(_record, i, labels=known)
+            policy = LocalizerPolicy(localizer, one, record=record_belief)
             # ("next", "uav", "observation") is the next step's: half the memory.
             collectors.append(episode_collector(env, policy, steps, compact_obs=True))
         return RoundRobin(collectors)
@@ -194,7 +239,7 @@ def trust(
         module=network,
         collector=collector,
         trainer=trainer,
-        score=partial(score, network, scenario.split(":")[0], score_runs),
+        score=partial(score, network, scenario.split(":")[0], 0 if recorded else score_runs),
     )
 
 

@@ -20,7 +20,7 @@ from agents.models.measurements.flow import BodyVelocities
 from agents.models.measurements.light import Lamps
 from agents.models.measurements.magnetic import MappedFields
 from agents.models.measurements.ranges import AnchorRanges, UavRanges
-from agents.models.measurements.rssi import SignalStrengths
+from agents.models.measurements.rssi import SignalStrengths, UavStrengths
 from agents.models.measurements.ultrasonic import WallDistances
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
 from agents.registry import NotServed
@@ -48,6 +48,7 @@ from coloc_env.sensors import (
     SlowFlight,
     Tdoa,
     UavBearings,
+    UavRssi,
     Ultrasonic,
     UnlabelledLandmarks,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "UavAngles",
     "UavRangeBearings",
     "UavRanges",
+    "UavStrengths",
     "WallDistances",
     "make_measurements",
     "measures",
@@ -102,6 +104,7 @@ MODELS: dict[type[Sensor], Callable[[Any], Measurement]] = {
     SlowFlight: Slowness,
     Tdoa: RangeDifferences,
     UavBearings: UavRangeBearings,
+    UavRssi: UavStrengths,
     Ultrasonic: WallDistances,
     UnlabelledLandmarks: LandmarkVectors,
 }

@@ -1,26 +1,54 @@
-"""Received signal strength of access points."""
+"""Received signal strength of access points and of other UAVs."""
 
 import math
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from agents.models.measurements.base import Block, Measurement, Neighbours, noise_std
 from agents.models.process import Process
 from coloc_env.observation import Observation
-from coloc_env.sensors import Rssi
+from coloc_env.sensors import Rssi, UavRssi
 from coloc_env.sensors.base import usable
 
 _BEND = math.sqrt(3)  # ‖d² ∂² ln d / ∂p²‖: eigenvalues −1, 1 and 1
 
 
-class SignalStrengths(Measurement):
+class _Strengths(Measurement):
     """z = P₀ − 10 n log₁₀ ‖p − A‖ − losses in known walls + noise, in dB."""
 
-    mask_leaf = "rssi_mask"
+    leaf: str
 
-    def __init__(self, sensor: Rssi) -> None:
-        self.sensor, self.variance = sensor, noise_std(sensor.std) ** 2
+    def __init__(self, sensor: Rssi | UavRssi) -> None:
+        self.loss, self.variance = sensor.loss, noise_std(sensor.loss.std) ** 2
+
+    def _block(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        points: Float[Tensor, "B N m d"],
+        derivatives: bool,
+    ) -> tuple[Block, Float[Tensor, "B N m 1 d"]]:
+        """The block of all points, and the derivatives by the own position."""
+        assert self.mask_leaf is not None
+        z, mask = usable(observation[self.leaf].unsqueeze(-1), observation[self.mask_leaf] > 0)
+        d = process.dim
+        expected, gradient = self.loss.expected(x[..., None, :d], points.to(x.dtype))
+        residual, by_place = z.to(x.dtype) - expected.unsqueeze(-1), gradient.unsqueeze(-2)
+        jacobian, curvature = x.new_zeros(0), None
+        if derivatives:
+            jacobian = x.new_zeros(*residual.shape, process.error_size)
+            jacobian[..., :d] = by_place
+            curvature = _BEND / self.loss.slope * by_place.square().sum(-1)  # of slope / d²
+        variance = x.new_tensor(self.variance).expand_as(residual)
+        return Block(residual, jacobian, variance, mask, curvature=curvature), by_place
+
+
+class SignalStrengths(_Strengths):
+    """Of access points at known places."""
+
+    leaf, mask_leaf = "rssi", "rssi_mask"
 
     def linearize(
         self,
@@ -30,21 +58,33 @@ class SignalStrengths(Measurement):
         neighbours: Neighbours,
         derivatives: bool = True,
     ) -> Block:
-        d = process.dim
-        z, mask = usable(observation["rssi"].unsqueeze(-1), observation[self.mask_leaf] > 0)
-        points = observation["rssi_map"].to(x.dtype).unflatten(-1, (-1, d))
-        expected, gradient = self.sensor.expected(x[..., None, :d], points)
-        residual = z.to(x.dtype) - expected.unsqueeze(-1)
-        jacobian, curvature = x.new_zeros(0), None
-        if derivatives:
-            jacobian = x.new_zeros(*residual.shape, process.error_size)
-            jacobian[..., 0, :d] = gradient
-            slope = 10 * self.sensor.exponent / math.log(10)
-            curvature = _BEND / slope * gradient.square().sum(-1, keepdim=True)  # of slope / d²
+        points = observation["rssi_map"].unflatten(-1, (-1, process.dim))
+        return self._block(process, x, observation, points, derivatives)[0]
+
+
+class UavStrengths(_Strengths):
+    """Of neighbours, whose position is uncertain as ``neighbours`` states."""
+
+    cooperative = True
+    leaf, mask_leaf = "uav_rssi", "uav_rssi_mask"
+
+    def linearize(
+        self,
+        process: Process,
+        x: Float[Tensor, "B N S"],
+        observation: Observation,
+        neighbours: Neighbours,
+        derivatives: bool = True,
+    ) -> Block:
+        points = neighbours.position
+        block, by_place = self._block(process, x, observation, points, derivatives)
+        known: Bool[Tensor, "B N m"] = block.mask & neighbours.known
         return Block(
-            residual=residual,
-            jacobian=jacobian,
-            variance=x.new_tensor(self.variance).expand_as(residual),
-            mask=mask,
-            curvature=curvature,
+            residual=block.residual,
+            jacobian=block.jacobian,
+            variance=block.variance,
+            mask=known,
+            partner=-by_place,
+            partner_variance=(by_place**2 * neighbours.variance.unsqueeze(-2)).sum(-1),
+            curvature=block.curvature,
         )

@@ -82,7 +82,7 @@ class Process(ABC):
         rotation = self.rotation(x)
         assert rotation is not None
         up = rotation[..., -1, :] if self.dim == 3 else torch.ones_like(covariance[..., 0])
-        along = (up.unsqueeze(-2) @ covariance @ up.unsqueeze(-1))[..., 0]
+        along = ((covariance * up.unsqueeze(-2)).sum(-1) * up).sum(-1, keepdim=True)
         return covariance + up.unsqueeze(-1) * (up * (UNIFORM_YAW**2 - along)).unsqueeze(-2)
 
     def _initial(

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from coloc_env.motion import Box
 from coloc_env.options import Count, Group, Metres, PositiveMetres, Share
-from coloc_env.sensors import AnchorRanging, RangeNoise, Rssi, RssiOptions, Tdoa
+from coloc_env.sensors import AnchorRanging, RangeNoise, Rssi, RssiOptions, Tdoa, UavRssi
 from coloc_env.sensors.ranging import Tags
 
 _SPOTS = (
@@ -76,14 +76,18 @@ class TdoaOptions(Group):
         return (Tdoa(places, self.tdoa_std, tags, dropout=lost, radius=near),)
 
 
-def access_points(
+def signal_strengths(
     options: RssiOptions, room: tuple[float, ...], walls: tuple[Box, ...]
-) -> tuple[Rssi, ...]:
+) -> tuple[Rssi | UavRssi, ...]:
     """The signal strengths that options ask for, in a room with sides in m with walls in it."""
-    if not options.rssi:
-        return ()
-    places = anchor_places("access_points", options.access_points, room)
-    return (options.true(places, walls),)
+    loss, dropout = options.loss(walls), options.rssi_dropout
+    found: list[Rssi | UavRssi] = []
+    if options.rssi:
+        places = anchor_places("access_points", options.access_points, room)
+        found.append(Rssi(places, loss, dropout))
+    if options.rssi_uavs:
+        found.append(UavRssi(loss, dropout))
+    return tuple(found)
 
 
 def anchor_places(

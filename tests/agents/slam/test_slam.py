@@ -59,7 +59,7 @@ def informed(belief: MapBelief, places: torch.Tensor) -> MapBelief:
 
 def test_with_the_map_it_is_the_joint_filter() -> None:
     overrides = {"anchors": 2, "n_uavs": 3, "prior_std": 0.3}
-    errors, *_ = run("slam:iterations=2", unknown(**overrides), [5, 9], 12, known=True)
+    errors, *_ = run("slam_central:iterations=2", unknown(**overrides), [5, 9], 12, known=True)
     others, *_ = run("ekf_joint", make_scenario("indoor-v0", landmarks=8, **overrides), [5, 9], 12)
     torch.testing.assert_close(errors, others, rtol=0, atol=2e-4)
 
@@ -73,17 +73,17 @@ def test_with_the_map_each_alone_is_a_filter_of_its_own() -> None:
         torch.testing.assert_close(errors, known, rtol=0, atol=3e-4)
 
 
-@pytest.mark.parametrize("maps", ["team", "own"])
-def test_a_first_step_is_scipys_least_squares(maps: str) -> None:
+@pytest.mark.parametrize("name", ["slam_central", "slam"])
+def test_a_first_step_is_scipys_least_squares(name: str) -> None:
     """Poses and landmarks of one step, all residuals whitened and given to scipy at once."""
     scenario = unknown(n_uavs=2, landmarks=5, uwb=False, landmark_radius=40.0)
     world = World(scenario)
     seen = world.reset(3)
-    localizer = make(f"slam:maps={maps}:iterations=12", scenario)
+    localizer = make(f"{name}:iterations=12", scenario)
     assert isinstance(localizer, Slam)
     before = localizer.reset(seen)
     belief, _ = localizer.step(before, seen)
-    for group in ([0, 1],) if maps == "team" else ([0], [1]):
+    for group in ([0, 1],) if localizer.centralized else ([0], [1]):
         mean, spread = least(localizer, before, seen, group)
         got = belief.landmarks[0, group[0]].numpy().ravel()
         np.testing.assert_allclose(got, mean[-15:], atol=2e-4)
@@ -122,7 +122,7 @@ def test_shared_maps_hold_what_one_map_of_the_team_does() -> None:
     """Without ranges, and with maps that take a step to arrive, both are nearly one estimate."""
     scenario = unknown(n_uavs=3, uwb=False, anchors=4, prior_std=0.5)
     (team, _, _, _), (shared, *_), (own, *_) = (
-        run(f"slam:maps={maps}", scenario, [1], 18) for maps in ("team", "shared", "own")
+        run(name, scenario, [1], 18) for name in ("slam_central", "slam", "slam:maps=own")
     )
     late = slice(5, None)
     between = float((team - shared)[late].norm(dim=-1).mean())
@@ -131,7 +131,7 @@ def test_shared_maps_hold_what_one_map_of_the_team_does() -> None:
 
 
 def test_a_team_with_anchors_finds_itself_and_the_map() -> None:
-    errors, distances, belief, places = run("slam", unknown(anchors=4, n_uavs=3), [0], 50)
+    errors, distances, belief, places = run("slam_central", unknown(anchors=4, n_uavs=3), [0], 50)
     assert float(errors[30:].norm(dim=-1).square().mean().sqrt()) < 0.3
     assert float(distances.mean()) < 9
     found = belief.found[:, 0]
@@ -152,8 +152,8 @@ def test_nothing_says_where_landmarks_are() -> None:
 def test_who_cannot_is_refused() -> None:
     with pytest.raises(ValueError, match="slam: the team has no landmarks to map"):
         make("slam", make_scenario("indoor-v0", anchors=4, landmarks=0))
-    with pytest.raises(ValueError, match="maps=team needs a slot for every UAV"):
-        make("slam", unknown(n_uavs=20))
+    with pytest.raises(ValueError, match="slam_central: each UAV needs a slot for every other"):
+        make("slam_central", unknown(n_uavs=20))
     with pytest.raises(
         ValueError, match=r"UnmappedLandmarks would be ignored; these use it: .*slam"
     ):

@@ -114,6 +114,7 @@ def test_antennas_stay_and_clocks_wander() -> None:
     torch.testing.assert_close(once.common, twice.common)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     [

@@ -9,11 +9,11 @@ import torch
 from scipy.stats import vonmises_fisher
 from torch import Tensor
 
-from coloc_env.bounds.information import own_information
+from coloc_env.bounds.information import own_information, shared_information
 from coloc_env.geometry import rotate_by, unrotate
 from coloc_env.motion import Kinematics, RandomVelocity
 from coloc_env.observation import Observation
-from coloc_env.sensors import Compass, Light, Magnetic, Rssi, Sensor, Ultrasonic
+from coloc_env.sensors import Compass, Light, Magnetic, Rssi, Sensor, UavRssi, Ultrasonic
 from tests.coloc_env.bounds.test_posterior import ANCHORS, N, first_step, scenario
 
 ROOM = ((0.0, 0.0, 0.0), (10.0, 8.0, 4.0))
@@ -33,7 +33,14 @@ def plane_compass(s: Compass, p: Kinematics, seen: Observation) -> tuple[Tensor,
 def rssi(s: Rssi, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
     points = torch.tensor(s.points, dtype=torch.float64)
     d = (p.position[0].unsqueeze(1) - points).norm(dim=-1)
-    return -40 - 22 * d.log10(), seen["rssi_mask"][0].double() / s.std**2
+    return -40 - 22 * d.log10(), seen["rssi_mask"][0].double() / 16
+
+
+def uav_rssi(s: UavRssi, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
+    pairs = [(i, j) for i in range(N) for j in range(N) if i != j]
+    far = torch.stack([(p.position[0, i] - p.position[0, j]).norm() for i, j in pairs])
+    mask = torch.stack([seen["uav_rssi_mask"][0, i, j] for i, j in pairs]).double()
+    return -40 - 22 * far.log10(), mask / 16
 
 
 def ultrasonic(s: Ultrasonic, p: Kinematics, seen: Observation) -> tuple[Tensor, Tensor]:
@@ -73,8 +80,10 @@ def magnetic(s: Magnetic, p: Kinematics, seen: Observation) -> tuple[Tensor, Ten
 CASES: list[tuple[Sensor, int, Callable]] = [
     (Compass(0.1, dropout=0.3), 3, compass),
     (Compass(0.1), 2, plane_compass),
-    (Rssi(ANCHORS, 4.0, dropout=0.3), 3, rssi),
-    (Rssi(tuple(a[:2] for a in ANCHORS), 4.0), 2, rssi),
+    (Rssi(ANCHORS, dropout=0.3), 3, rssi),
+    (Rssi(tuple(a[:2] for a in ANCHORS)), 2, rssi),
+    (UavRssi(dropout=0.3), 3, uav_rssi),
+    (UavRssi(), 2, uav_rssi),
     (Ultrasonic(ROOM, 0.03, dropout=0.2), 3, ultrasonic),
     (Magnetic(ROOM, 0.5), 3, magnetic),
 ]
@@ -110,7 +119,10 @@ def test_information_is_that_of_the_log_likelihood(case: tuple[Sensor, int, Call
     jacobian = jacobian.reshape(-1, N * d)
     assert (weights > 0).any()
     wanted = jacobian.mT @ (weights.unsqueeze(-1) * jacobian)
-    found = torch.block_diag(*own_information(sensor, truth, seen)[0])
+    if sensor.between_uavs:
+        found = shared_information(sensor, truth, seen)[0].flatten(2).flatten(0, 1)
+    else:
+        found = torch.block_diag(*own_information(sensor, truth, seen)[0])
     torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
 
 

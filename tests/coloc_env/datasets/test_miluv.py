@@ -240,6 +240,7 @@ def test_a_configuration_that_nests_without_end(write: Writer) -> None:
         load_miluv(write({"config/height/bias.yaml": deep}))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_any_damage_is_read_or_a_data_error(

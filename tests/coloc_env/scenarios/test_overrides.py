@@ -39,6 +39,9 @@ LANDMARKS: dict[str, Any] = {
     "false_matches": 0.5,
     "landmark_dropout": 0.5,
     "range_only": (0.0, 1.0),
+    "association": "unknown",
+    "alias_time": 3.0,
+    "landmark_placement": "symmetric",
     "landmark_field": 1.0,
 }
 INS: dict[str, Any] = {"ins_std": 1.0, "ins_bias": 1.0, "ins_bias_time": 5.0}
@@ -104,6 +107,7 @@ CARRIED: dict[str, Any] = {
     "light_radius": 5.0,
     "rssi": True,
     "access_points": 3,
+    "rssi_uavs": True,
     "rssi_std": 9.0,
     "rssi_power": -30.0,
     "rssi_exponent": 3.0,
@@ -172,6 +176,8 @@ CHANGED: dict[str, dict[str, Any]] = {
         **CONTROL,
         "v_max": 2.0,
         **PRIOR,
+        "prior_attitude_std": 0.4,
+        "prior_yaw": "uniform",
         "comm_radius": 3.0,
     },
     "wsn-v0": {
@@ -260,6 +266,7 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "obstacle_speed": {"obstacles": 9},
         "gust_time": {"gust_std": 0.5},
         "nlos_anchor": {"anchors": 2},
+        "alias_time": {"false_matches": 0.5},
         "kidnapped": {"kidnap_at": 0.2},
         "accel_bias": {"imu_bias": True},
         "gyro_bias": {"imu_bias": True},
@@ -272,6 +279,7 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"compass": True} for name in CARRIED if name.startswith("compass_")},
         **{n: {"light": True} for n in CARRIED if n.startswith(("light_", "lamp"))},
         **{n: {"rssi": True} for n in CARRIED if n.startswith(("rssi_", "access"))},
+        "rssi_uavs": {},
         "rssi_wall_loss": {"rssi": True, "walls": IN_THE_WAY},
         **{name: {"ultrasonic": True} for name in CARRIED if name.startswith("ultrasonic_")},
         **{

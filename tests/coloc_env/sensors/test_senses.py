@@ -15,7 +15,18 @@ from torch import Tensor
 from coloc_env.geometry.walls import depth
 from coloc_env.motion import Arena
 from coloc_env.scenarios import make_scenario
-from coloc_env.sensors import Compass, Layout, Light, Magnetic, Rssi, Sensor, Ultrasonic
+from coloc_env.sensors import (
+    Compass,
+    Layout,
+    Light,
+    Magnetic,
+    PathLoss,
+    Rssi,
+    Sensor,
+    Sight,
+    UavRssi,
+    Ultrasonic,
+)
 from coloc_env.sensors.light import lamp_places, scattered
 from coloc_env.world import World
 from tests.coloc_env.sensors.test_field_sensors import is_normal, seen_by
@@ -26,8 +37,9 @@ LAMPS = lamp_places(6, ROOM[1])
 POINTS = ((0.0, 0.0, 0.0), (30.0, 20.0, 5.0), (30.0, 0.0, 0.0))
 EVERY: list[Sensor] = [
     Compass(0.1, dropout=0.3),
-    Light(LAMPS, walls=WALLS),
-    Rssi(POINTS, walls=WALLS, dropout=0.2),
+    Light(LAMPS, sight=Sight(WALLS, 3)),
+    Rssi(POINTS, PathLoss(walls=WALLS), dropout=0.2),
+    UavRssi(PathLoss(walls=WALLS), dropout=0.2),
     Ultrasonic(ROOM, walls=WALLS),
     Magnetic(ROOM, dropout=0.2),
 ]
@@ -58,7 +70,7 @@ def test_a_compass_shows_the_heading() -> None:
 
 def test_lamps_are_dimmer_farther_away_and_seen_from_below() -> None:
     """By the formula, in numpy, where no wall is between."""
-    sensor = Light(LAMPS, walls=WALLS, radius=9.0)
+    sensor = Light(LAMPS, sight=Sight(WALLS), radius=9.0)
     errors, hidden = [], 0
     lamps = torch.tensor(LAMPS, dtype=torch.float64)
     for seen, truth in seen_by(sensor, 20, 10):
@@ -112,7 +124,7 @@ def test_lamps_hang_evenly_on_the_ceiling(count: int) -> None:
 
 
 def test_strength_falls_with_the_distance_and_behind_walls() -> None:
-    sensor, errors, losses = Rssi(POINTS, walls=WALLS), [], set()
+    sensor, errors, losses = Rssi(POINTS, PathLoss(walls=WALLS)), [], set()
     points = torch.tensor(POINTS, dtype=torch.float64)
     for seen, truth in seen_by(sensor, 20, 10):
         apart = truth.position.unsqueeze(-2) - points
@@ -123,6 +135,20 @@ def test_strength_falls_with_the_distance_and_behind_walls() -> None:
         errors.append(seen["rssi"] - exact)
     assert losses == {0, 1, 2}
     is_normal(torch.cat(errors), 4.0)
+
+
+def test_uavs_hear_each_other_each_for_itself() -> None:
+    """With the same loss on the way, but noise of their own; nobody hears itself."""
+    errors, both = [], []
+    for seen, truth in seen_by(UavRssi(PathLoss(std=2.0)), 20, 10):
+        far = torch.cdist(truth.position, truth.position)
+        mask = seen["uav_rssi_mask"] > 0
+        assert torch.equal(mask, ~torch.eye(6, dtype=torch.bool).expand(20, 6, 6))
+        error = seen["uav_rssi"] + 40 + 22 * far.log10()
+        errors.append(error[mask])
+        both.append((error * error.mT)[mask])
+    is_normal(torch.cat(errors), 2.0)
+    assert abs(float(torch.cat(both).mean())) < 0.3
 
 
 def test_ultrasound_shows_the_nearest_wall_ahead() -> None:
@@ -222,7 +248,9 @@ def test_walls_of_the_network_are_what_senses_meet() -> None:
     wall = (11.0, 5.0, 0.0, 11.5, 12.0, 5.0)
     scenario = make_scenario("indoor-v0", walls=wall, light=True, rssi=True, ultrasonic=True)
     for sensor in scenario.sensors[-3:]:
-        assert sensor.walls == (((11.0, 5.0, 0.0), (11.5, 12.0, 5.0)),)  # type: ignore[attr-defined]
+        found = {Rssi: "loss", Light: "sight"}.get(type(sensor))
+        walls = (getattr(sensor, found) if found else sensor).walls
+        assert walls == (((11.0, 5.0, 0.0), (11.5, 12.0, 5.0)),)
 
 
 @pytest.mark.parametrize(
@@ -235,10 +263,10 @@ def test_walls_of_the_network_are_what_senses_meet() -> None:
         (Light, {"lamps": LAMPS, "angle_std": 0.0}, "angle_std=0.0 is not allowed: an angle"),
         (Light, {"lamps": LAMPS, "share": 1.0}, "share=1.0 is not allowed: a share"),
         (Rssi, {"points": ()}, "at least one access point"),
-        (Rssi, {"points": POINTS, "exponent": 0.0}, "exponent=0.0 is not allowed: a number > 0"),
+        (PathLoss, {"exponent": 0.0}, "exponent=0.0 is not allowed: a number > 0"),
         (
-            Rssi,
-            {"points": POINTS, "wall_loss": -1.0},
+            PathLoss,
+            {"wall_loss": -1.0},
             "wall_loss=-1.0 is not allowed: a loss in dB",
         ),
         (Ultrasonic, {"room": ROOM, "reach": 0.0}, "reach=0.0 is not allowed: a distance in m > 0"),

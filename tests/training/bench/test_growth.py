@@ -13,6 +13,7 @@ from training.bench.sweep import Sweep, measure
 from training.pool import Workers
 
 
+@pytest.mark.slow
 def test_a_quick_measurement_of_growth(tmp_path: Path) -> None:
     bench.bench_growth(tmp_path / "out", True, torch.device("cpu"))
     found = json.loads((tmp_path / "out" / "growth.json").read_text())

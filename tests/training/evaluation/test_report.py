@@ -141,6 +141,7 @@ setTimeout(() => {
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 def test_a_browser_shows_it(evaluation, tmp_path) -> None:
     made = runs.of(evaluation, "first")

@@ -127,6 +127,7 @@ def test_any_pettingzoo_policy_scores() -> None:
         score("schedule-v0:horizon=3", from_pettingzoo(lambda: silent), 4)
 
 
+@pytest.mark.slow
 def test_several_seeds_have_an_interval_of_their_own() -> None:
     found = score("convoy-v0:horizon=25", "all_go,half_speed,leapfrog,idle", 5)
     each = [

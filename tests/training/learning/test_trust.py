@@ -35,6 +35,7 @@ SMALL = {
     "score_runs": 0,
 }
 VARIANTS = ("", "nlos=0.3")
+DEFAULTS = {"labels": "truth", "variants": None}
 BATCHES = len(VARIANTS) * 10 // 5  # an epoch's
 
 
@@ -264,6 +265,7 @@ def test_interrupted_in_training(
     assert outcome(tmp_path / "run") == unbroken
 
 
+@pytest.mark.slow
 def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "SCORED", ("", "nlos=0.3"))
     options = {**SMALL, "epochs": 1, "score_runs": 1}
@@ -273,7 +275,7 @@ def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert card["features"] == list(TrustNetwork(relative=True).features)
     assert card["training"] == "trust"
     assert card["command"].startswith("coloc train trust --set scenario=indoor-v0:n_uavs=3")
-    assert card["options"] == {"learning_rate": 1e-3, "seed": 0, "start": "trust", **options}
+    assert card["options"] == {"learning_rate": 1e-3, "seed": 0, "start": "trust", **DEFAULTS, **options}
     assert card["epochs"] == 1
     assert card["frames"] == 10 * len(VARIANTS)
     assert card["metrics"].keys() >= {"loss_trust", "grad_norm", "optim_steps"}

@@ -113,6 +113,7 @@ def test_claims_about_recordings_follow_the_runs(settings: Settings) -> None:
     assert {v.reason for v in judge(real(settings), Made({}, one))} == {"one run only"}
 
 
+@pytest.mark.slow
 def test_a_small_page(tmp_path: Path) -> None:
     variants, agents = ["stein2d-outliers=0.2"], ["cspf:particles=1", "pf_joint:anneal=0.96"]
     for report_only in (False, True):  # the second time from the store

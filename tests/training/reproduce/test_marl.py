@@ -80,6 +80,7 @@ def test_a_goal_is_judged_by_the_mean_and_where_asked_by_the_interval(
     assert one.verdict == UNKNOWN
 
 
+@pytest.mark.slow
 def test_a_tiny_study_trains_runs_resumes_and_reports(tmp_path: Path) -> None:
     scenario = "indoor-v0:n_uavs=2:motion=random:horizon=10"
     policies = (

@@ -225,6 +225,7 @@ def test_every_scenario_of_the_plan_can_be_built(tmp_path: Path) -> None:
     assert len(plan.trained_on()) == 27
 
 
+@pytest.mark.slow
 def test_a_small_page(tmp_path: Path) -> None:
     variants = ["case1", "case1-kidnap_at=18", "trained-q=1-believed_uwb_std=0.6"]
     agents = [

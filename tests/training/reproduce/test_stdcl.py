@@ -343,6 +343,7 @@ def test_goals_are_met_by_the_mean() -> None:
 # ---------------------------------------------------------------- all of it at once
 
 
+@pytest.mark.slow
 def test_a_small_page(tmp_path: Path) -> None:
     variants, agents = ["v50", "nlos-0.5", "time-20"], ["mds", OPTIMIZER, WHOLE, plan.UNFED]
     small: dict[str, Any] = {"variants": variants, "agents": agents, "steps": 4}
