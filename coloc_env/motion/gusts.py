@@ -32,8 +32,8 @@ class Gusts(Motion):
     unit density. Every UAV has its own. Each step is exact (Van Loan, IEEE Trans. Automatic Control
     23(3), 1978), and step 0 is of the stationary process. The attitude stays that of the path.
 
-    With the defaults UAVs are 6 cm off along each axis (standard deviation). Nothing keeps them in the arena
-    under gusts that are many times as strong.
+    With the defaults UAVs are 6 cm off along each axis (standard deviation). Nothing keeps them in
+    the arena under gusts that are many times as strong.
     """
 
     motion: Motion

@@ -14,14 +14,16 @@ from torch import Tensor
 from agents import make
 from agents.models.measurements import AnchorRanges
 from agents.policies.adapters import LocalizerPolicy
+from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import AnchorRanging, Landmarks
 from training.learning.episodes import Episode
 
 LATE = 1.0  # s, after which a smoothed window's state is a label
-AROUND = 5  # steps before and after, over which trilaterated positions are averaged
+AROUND = 5  # steps before and after, whose ranges a trilateration fits
 _WINDOW = 20  # steps of the smoother, and more where LATE asks for them
-_ITERATIONS = 10  # of Gauss–Newton
+_ITERATIONS = 20  # of Gauss–Newton
+_KNOWN = 1.0  # m, standard deviation of a trilaterated position that is no label any more
 _GROSS = 4.0  # standard deviations of a tie, beyond which somebody took one landmark for another
 
 
@@ -48,7 +50,7 @@ def labels_of(kind: str, scenario: Scenario, worlds: int, seed: int, device: str
 
 
 def calibrated(scenario: Scenario, worlds: int, seed: int, device: str = "cpu") -> Labels:
-    """Trilateration from anchor ranges, averaged over ± ``AROUND`` steps. ValueError for a scenario
+    """Trilateration from the anchor ranges of ± ``AROUND`` steps. ValueError for a scenario
     without anchors, or whose antennas are off the centre."""
     sensor = scenario.believed.sensor(AnchorRanging)
     if sensor is None or sensor.tags:
@@ -61,55 +63,48 @@ def calibrated(scenario: Scenario, worlds: int, seed: int, device: str = "cpu") 
     batch = _episode(scenario, worlds, seed, policy, device)
     d = scenario.arena.dim
     seen = batch["uav", "observation"]
-    ranges, there = AnchorRanges(sensor).read(_Leaves(seen))
+    ranges, there = AnchorRanges(sensor).read(Observation(dict(seen.items())))
     anchors = seen["anchor_map"].double().unflatten(-1, (-1, d))
     start = batch["uav", "action"][..., :d].double()
-    return averaged(trilaterated(start, anchors, ranges.double(), there))
-
-
-class _Leaves(dict[str, Tensor]):
-    """An episode's leaves, as a measurement model reads those of a step."""
-
-    def __init__(self, seen: TensorDictBase) -> None:
-        super().__init__(seen.items())
-
-    def once(self, key: object, make: Any) -> Any:
-        return make()
+    offset = torch.arange(-AROUND, AROUND + 1, device=start.device)
+    steps = torch.arange(batch.shape[1], device=start.device).unsqueeze(-1) + offset  # [T, W]
+    inside = (steps >= 0) & (steps < batch.shape[1])
+    near = steps.clamp(0, batch.shape[1] - 1)
+    z = ranges.double()[:, near].transpose(2, 3)  # [B, T, N, W, A]
+    counted = (there[:, near] & inside[..., None, None]).transpose(2, 3)
+    lag = offset.double() * scenario.arena.dt
+    p, known = trilaterated(start, anchors, z, counted, lag, max(sensor.noise.std, 1e-3))
+    return Labels(p, known & batch["uav", "mask"])
 
 
 def trilaterated(
     start: Float[Tensor, "*s d"],
     anchors: Float[Tensor, "*s A d"],
-    ranges: Float[Tensor, "*s A"],
-    there: Bool[Tensor, "*s A"],
-) -> Labels:
-    """min Σ (ρ − ‖p − a‖)² by Gauss–Newton from ``start``; known where more anchors than dimensions
-    answer and the normal equations are well conditioned."""
-    p, weight = start, there.to(start)
+    ranges: Float[Tensor, "*s W A"],
+    there: Bool[Tensor, "*s W A"],
+    lag: Float[Tensor, " W"],
+    std: float,
+) -> tuple[Float[Tensor, "*s d"], Bool[Tensor, "*s"]]:
+    """min Σ_wa (ρ_wa − ‖p + v τ_w − a‖)² over position and velocity by Gauss–Newton from
+    ``start``, ranges of σ ``std`` (m) being measured ``lag`` τ (s) later; known where the
+    position's standard deviation is below ``_KNOWN``."""
     d = start.shape[-1]
-    eye = torch.eye(d, dtype=start.dtype, device=start.device)
-    normal = eye.expand(*start.shape, d)
+    x = torch.cat((start, torch.zeros_like(start)), -1)
+    weight = there.to(x)
+    eye = torch.eye(2 * d, dtype=x.dtype, device=x.device)
+    information = eye.expand(*x.shape, 2 * d)
     for _ in range(_ITERATIONS):
-        apart = p.unsqueeze(-2) - anchors
+        p = x[..., None, :d] + lag.unsqueeze(-1) * x[..., None, d:]  # [*s, W, d]
+        apart = p.unsqueeze(-2) - anchors.unsqueeze(-3)
         distance = apart.norm(dim=-1).clamp_min(1e-6)
-        j = apart / distance.unsqueeze(-1) * weight.unsqueeze(-1)
-        normal = j.mT @ j
-        step = j.mT @ ((ranges - distance) * weight).unsqueeze(-1)
-        p = p + torch.linalg.solve(normal + 1e-6 * eye, step)[..., 0]
-    least = torch.linalg.eigvalsh(normal)[..., 0]
-    known = (there.sum(-1) > d) & (least > 0.01) & p.isfinite().all(-1)
-    return Labels(torch.where(known.unsqueeze(-1), p, 0.0), known)
-
-
-def averaged(labels: Labels, around: int = AROUND) -> Labels:
-    """Each label the mean of those within ``around`` steps; known where it was."""
-    steps = labels.known.shape[1]
-    k = torch.arange(steps, device=labels.known.device)
-    near = ((k[:, None] - k).abs() <= around).to(labels.position)
-    weight = labels.known.to(labels.position)
-    total = torch.einsum("tk,bknd->btnd", near, labels.position * weight.unsqueeze(-1))
-    count = torch.einsum("tk,bkn->btn", near, weight).clamp_min(1)
-    return Labels(total / count.unsqueeze(-1), labels.known)
+        u = apart / distance.unsqueeze(-1) * weight.unsqueeze(-1)
+        j = torch.cat((u, lag[:, None, None] * u), -1).flatten(-3, -2)
+        information = j.mT @ j + 1e-9 * eye
+        residual = ((ranges - distance) * weight).flatten(-2)
+        x = x + torch.linalg.solve(information, j.mT @ residual.unsqueeze(-1))[..., 0]
+    variance = torch.linalg.inv(information).diagonal(dim1=-2, dim2=-1)[..., :d].sum(-1)
+    known = (std**2 * variance < _KNOWN**2) & x.isfinite().all(-1)
+    return torch.where(known.unsqueeze(-1), x[..., :d], 0.0), known
 
 
 # ---------------------------------------------------------------- self-supervised: the team agrees

@@ -139,9 +139,7 @@ class Samples:
         where, known = self.late.at(int(before.step.flatten()[0]))
         return where.to(before.last), there & known
 
-    def _contrasted(
-        self, before: Any, after: Any, tensordict: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _contrasted(self, before: Any, after: Any, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The particles before the step moved by the IMU, half of them by what moved a particle of
         the next UAV."""
         d, half = self.dim, self.size // 2
@@ -209,7 +207,7 @@ def pfnn(
     ``dfgo``'s smoothed window a second later, UAVs tied by landmarks that they see in common;
     ``prediction``, the motion model's, at a tenth of the ``learning_rate`` (the paper's online
     phase); ``contrastive``, displacements that fit the IMU against other particles'.
-    ``start``: the checkpoint whose weights it starts from (``none``: random ones).
+    ``start``: the checkpoint whose weights it starts from, by name or path (``none``: random).
 
     The ``scenario`` takes overrides: ``indoor-v0:motion=random:horizon=300``. At the end ``apf``
     and ``pfnn`` are compared in ``score_runs`` held-out worlds of it.

@@ -121,6 +121,7 @@ class TrustLoss(LossModule):
             observation = Observation({name: seen[name] for name in all_leaves(scenario)})
             belief, estimate = ekf.step(belief, observation)
             if where is None:
+                assert isinstance(ekf.screen, Watched)
                 loss, count = ekf.screen.surprise(belief.covariance)
             else:
                 offset = estimate.position - where[:, t]
@@ -186,8 +187,8 @@ def trust(
     believed, combinations) are run with the newest weights, in turn by the filter alone and by its
     bank; every ``steps`` steps the position's negative log-likelihood is backpropagated through
     the learned filter. ``variants``: overrides of ``scenario``, separated by slashes (none: those
-    above; a recording as it is). The learning rate falls linearly to a twentieth. ``start``: the checkpoint
-    whose weights it starts from (``none``: random ones).
+    above; a recording as it is). The learning rate falls linearly to a twentieth. ``start``: the
+    checkpoint whose weights it starts from, by name or path (``none``: random ones).
 
     ``labels``: the ``truth``; or, without any truth, ``left_out``, the likelihood of each
     measurement predicted by all others and the past in place of the position's, or
@@ -198,9 +199,9 @@ def trust(
     (none on a recording).
     """
     recorded = isinstance(parse_scenario(scenario).motion, RecordedMotion)
-    chosen = ("",) if recorded else VARIANTS
+    chosen: Sequence[str] = ("",) if recorded else VARIANTS
     if variants is not None:
-        chosen = tuple(variants.split("/"))
+        chosen = variants.split("/")
     scenarios = [parse_scenario(scenario, variant) for variant in chosen]
     require_batches("trust", scenarios, steps)
     network = _first(start, seed).to(device)

@@ -275,7 +275,13 @@ def test_card_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert card["features"] == list(TrustNetwork(relative=True).features)
     assert card["training"] == "trust"
     assert card["command"].startswith("coloc train trust --set scenario=indoor-v0:n_uavs=3")
-    assert card["options"] == {"learning_rate": 1e-3, "seed": 0, "start": "trust", **DEFAULTS, **options}
+    assert card["options"] == {
+        "learning_rate": 1e-3,
+        "seed": 0,
+        "start": "trust",
+        **DEFAULTS,
+        **options,
+    }
     assert card["epochs"] == 1
     assert card["frames"] == 10 * len(VARIANTS)
     assert card["metrics"].keys() >= {"loss_trust", "grad_norm", "optim_steps"}

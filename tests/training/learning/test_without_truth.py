@@ -19,12 +19,12 @@ from coloc_env.scenarios import parse_scenario
 from tests.sampling import first_fast
 from training.evaluation.evaluate import silent
 from training.learning import run
-from training.learning.labels import averaged, calibrated, smoothed, tied, trilaterated
+from training.learning.labels import calibrated, smoothed, tied, trilaterated
 from training.learning.left_out import DEGREES, left_out
 from training.learning.pfnn import LabelName as CorrectorLabels
 from training.learning.trust import LabelName as TrustLabels
 
-ROOM = "indoor-v0:n_uavs=2:anchors=6:horizon=40"
+ROOM = "indoor-v0:n_uavs=2:anchors=8:horizon=40"
 LEAST = {"scenario": ROOM, "worlds": 1, "epochs": 1, "score_runs": 0}
 MODES = [
     *(("pfnn", {"labels": one, "passes": 1}) for one in CorrectorLabels.__args__ if one != "truth"),
@@ -53,7 +53,8 @@ def hide(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(CoLocEnv, "_observe", blind)
 
 
-@pytest.mark.parametrize("mode", first_fast(*MODES))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
 def test_no_loss_reads_the_truth(
     mode: tuple[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,9 +70,7 @@ def test_no_loss_reads_the_truth(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
-def test_it_learns_and_from_given_weights(
-    mode: tuple[str, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_it_learns_and_from_given_weights(mode: tuple[str, dict[str, Any]], tmp_path: Path) -> None:
     """Weights move from those that it starts from; a run's file does as well as a name."""
     name, options = mode
     first = trained(name, options, tmp_path / "first")
@@ -82,59 +81,47 @@ def test_it_learns_and_from_given_weights(
     assert any(not torch.equal(second[key], value) for key, value in first.items())
 
 
+@pytest.mark.slow
 def test_the_truth_is_needed_for_its_own_labels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That the truth hidden is a truth not read would say nothing if it could not be hidden."""
-    seen = trained("pfnn", {"passes": 1}, tmp_path / "seen")
     hide(monkeypatch)
-    with pytest.raises((ValueError, RuntimeError, ZeroDivisionError)):
-        blind = trained("pfnn", {"passes": 1}, tmp_path / "blind")
-        assert any(not torch.equal(blind[key], value) for key, value in seen.items())
-        raise ValueError
+    with pytest.raises(ValueError, match="NaN"):
+        trained("trust", {"variants": "horizon=20", "steps": 5}, tmp_path / "blind")
 
 
 # ---------------------------------------------------------------- labels
 
 
 def test_trilateration_is_scipys() -> None:
+    """Of moving UAVs, some of whose ranges are missing."""
     g = torch.Generator().manual_seed(0)
     anchors = 10 * torch.rand(6, 3, generator=g, dtype=torch.float64)
     places = 2 + 6 * torch.rand(5, 3, generator=g, dtype=torch.float64)
-    ranges = torch.cdist(places, anchors) + 0.1 * torch.randn(5, 6, generator=g).double()
-    there = torch.rand(5, 6, generator=g) < 0.9
+    lag = torch.tensor([-0.2, 0.0, 0.3]).double()
+    along = places.unsqueeze(1) + lag.unsqueeze(-1) * torch.tensor([0.5, -1.0, 0.2])
+    noise = 0.05 * torch.randn(5, 3, 6, generator=g).double()
+    ranges, there = torch.cdist(along, anchors) + noise, torch.rand(5, 3, 6, generator=g) < 0.9
+    there[4, :, 1:] = False
     start = torch.full((5, 3), 5.0).double()
-    found = trilaterated(start, anchors.expand(5, 6, 3), ranges, there)
-    for k in range(5):
-        a, r = anchors[there[k]].numpy(), ranges[k][there[k]].numpy()
+    found, known = trilaterated(start, anchors.expand(5, 6, 3), ranges, there, lag, 0.05)
+    assert known.tolist() == [True, True, True, True, False]
+    for k in range(4):
 
-        def residual(p: Any, a: Any = a, r: Any = r) -> Any:
-            return ((p - a) ** 2).sum(1) ** 0.5 - r
+        def residual(x: Any, k: int = k) -> Any:
+            p = x[:3] + lag.numpy()[:, None] * x[3:]
+            apart = ((p[:, None] - anchors.numpy()) ** 2).sum(-1) ** 0.5 - ranges[k].numpy()
+            return apart[there[k].numpy()]
 
-        expected = least_squares(residual, start[k].numpy(), xtol=1e-12, gtol=1e-12).x
-        assert found.known[k] == (len(a) > 3)
-        if found.known[k]:
-            torch.testing.assert_close(
-                found.position[k], torch.from_numpy(expected), atol=1e-5, rtol=0
-            )
-
-
-def test_averages_are_over_the_steps_around() -> None:
-    labels = trilaterated(
-        torch.zeros(1, 30, 1, 2).double(),
-        torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]).double().expand(1, 30, 1, 3, 2),
-        torch.rand(1, 30, 1, 3, generator=torch.Generator().manual_seed(1)).double() + 2,
-        torch.ones(1, 30, 1, 3, dtype=torch.bool),
-    )
-    labels = replace(labels, known=labels.known & (torch.arange(30) != 12)[:, None])
-    found = averaged(labels)
-    kept = [k for k in range(5, 16) if k != 12]
-    torch.testing.assert_close(found.position[0, 10], labels.position[0, kept].mean(0))
+        begin = [*start[k].tolist(), 0.0, 0.0, 0.0]
+        expected = least_squares(residual, begin, ftol=1e-15, xtol=1e-12, gtol=1e-12).x
+        torch.testing.assert_close(found[k], torch.from_numpy(expected[:3]), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("make", [calibrated, smoothed])
+@pytest.mark.parametrize("make", first_fast(calibrated, smoothed))
 def test_labels_are_near_the_truth(make: Any) -> None:
-    """Nearer than a single trilateration; and of the steps that they say."""
+    """As near as a single range's noise, or its half; and of the steps that they say."""
     scenario = parse_scenario(ROOM)
     labels = make(scenario, 1, 7)
     env = CoLocEnv(scenario, 1, seed=7)
@@ -142,7 +129,7 @@ def test_labels_are_near_the_truth(make: Any) -> None:
     true = batch["state"].unflatten(-1, (2, -1))[..., :3].double()
     off = (labels.position - true).norm(dim=-1)[labels.known]
     assert labels.known.sum() >= 40
-    assert off.square().mean().sqrt() < (0.25 if make is calibrated else 0.1)
+    assert off.square().mean().sqrt() < (0.4 if make is calibrated else 0.1)
     if make is smoothed:
         assert not labels.known[:, -10:].any()
 
