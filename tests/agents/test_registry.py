@@ -55,7 +55,7 @@ REFUSALS = {
     "ekf:robust=hubert": [
         "ekf",
         "robust='hubert'",
-        "none, or some of huber, gate, ransac, temporal, cross joined by +",
+        "none, or some of huber, student, mixture, gate, ransac, temporal, cross joined by +",
     ],
     "ekf:iterations=two": ["ekf", "iterations='two'", "a whole number"],
     "ekf:iterations=2.5": ["ekf", "iterations='2.5'", "a whole number"],
@@ -72,7 +72,7 @@ REFUSALS = {
     "ekf:robust=": [
         "ekf",
         "robust=''",
-        "none, or some of huber, gate, ransac, temporal, cross joined by +",
+        "none, or some of huber, student, mixture, gate, ransac, temporal, cross joined by +",
     ],
     "ekf:robust=huber=gate": ["ekf", "robust='huber=gate'"],
     "ekf:robust=huber:robust=gate": ["ekf", "robust", "twice"],

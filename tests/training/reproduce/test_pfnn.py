@@ -405,7 +405,10 @@ def test_figures_2_to_8(monkeypatch: pytest.MonkeyPatch) -> None:
         (["--runs", "0"], "--runs 0"),
         (["--jobs", "0"], "--jobs 0"),
         (["--seed", "-1"], "--seed -1"),
-        (["--part", "campus"], "pfnn has no part 'campus': paper, robustness, all are allowed"),
+        (
+            ["--part", "campus"],
+            "pfnn has no part 'campus': paper, robustness, rivals, regimes, all are allowed",
+        ),
         (["--report-only"], "holds nothing yet: run without --report-only first"),
         (["--page", "x.md"], "results.json does not exist: run the study first"),
     ],
