@@ -10,6 +10,7 @@ from coloc_env.geometry.walls import crossed, depth, near
 POINT = st.tuples(*(st.floats(-5.0, 15.0) for _ in range(3)))
 WALLS = (((0.0, 0.0, 0.0), (1.0, 10.0, 5.0)), ((4.0, 2.0, 1.0), (6.0, 8.0, 3.0)))
 SAMPLES = 4001
+ROUNDING = 1e-9  # m
 
 
 def along(start, end):
@@ -25,7 +26,8 @@ def test_crossings_and_depth_are_those_of_points_along_the_segment(a, b):
     fine = length / (SAMPLES - 1)
     within, metres = 0, 0.0
     for low, high in WALLS:
-        inside = ((points > torch.tensor(low)) & (points < torch.tensor(high))).all(-1)
+        bottom, top = (torch.tensor(x, dtype=torch.float64) for x in (low, high))
+        inside = ((points > bottom + ROUNDING) & (points < top - ROUNDING)).all(-1)
         within += bool(inside.any())
         metres += float(inside.sum()) * fine
     got = depth(start, end, WALLS)
