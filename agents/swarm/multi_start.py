@@ -15,10 +15,10 @@ def starts_about(
     """``start`` and ``count`` − 1 draws about it, of ``variance`` (m²) per axis; the same draws in
     every world and step."""
     yield start
-    draws = torch.Generator(start.device).manual_seed(0)
+    draws = torch.Generator().manual_seed(0)  # the CPU's: the same on every device
     for _ in range(count - 1):
         white = torch.randn(start.shape[1:], generator=draws, dtype=start.dtype)
-        yield start + variance.sqrt().unsqueeze(-1) * white
+        yield start + variance.sqrt().unsqueeze(-1) * white.to(start.device)
 
 
 def best_of(
