@@ -8,7 +8,7 @@ from torch import Tensor
 
 from agents.models.measurements import LandmarkVectors, no_neighbours
 from agents.models.process import Process
-from agents.robust.mahalanobis import innovation_terms, whitened_squares
+from agents.robust.mahalanobis import eliminated, innovation_covariance
 from agents.robust.screen import Prediction
 from coloc_env.observation import Observation
 from coloc_env.sensors.base import usable
@@ -36,8 +36,7 @@ def candidates(model: LandmarkVectors, process: Process, prior: Prediction) -> C
     seen, d, x = prior.observation, process.dim, prior.state
     z = seen["unlabelled_landmarks"].unflatten(-1, (-1, d))
     z, mask = usable(z, seen["unlabelled_landmark_mask"] > 0)
-    z, turn = z.to(x.dtype), process.attitude_error
-    pose = [*range(d), *([] if turn is None else range(turn.start, turn.stop))]
+    z, pose = z.to(x.dtype), process.pose_errors
     points = seen["landmark_map"]
     nothing = {
         "landmarks": torch.zeros_like(points),
@@ -47,15 +46,10 @@ def candidates(model: LandmarkVectors, process: Process, prior: Prediction) -> C
     block = model.linearize(process, x, Observation(nothing), no_neighbours(x[..., :d]))
     expected = -block.residual
     spread = block.jacobian @ prior.covariance.unsqueeze(-3)
-    s = [
-        [(spread[..., i, :] * block.jacobian[..., j, :]).sum(-1) for j in range(i + 1)]
-        for i in range(d)
-    ]
-    for i in range(d):
-        s[i][i] = s[i][i] + model.std**2
+    s = innovation_covariance(spread, block.jacobian, [model.std**2] * d)
     apart = z.unsqueeze(-2) - expected.unsqueeze(-3)
-    terms = whitened_squares(apart.unbind(-1), [[c.unsqueeze(-2) for c in row] for row in s])
-    pivots = innovation_terms(block, prior.covariance)[1]
+    terms, wide = eliminated(apart.unbind(-1), [[c.unsqueeze(-2) for c in row] for row in s])
+    pivots = [pivot.squeeze(-2) for pivot in wide]
     log_det = sum((pivot.log() for pivot in pivots[1:]), pivots[0].log())
     return Candidates(
         z=z,

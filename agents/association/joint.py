@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from agents.association.candidates import Candidates
-from agents.robust.mahalanobis import chi_square, whitened_squares
+from agents.robust.mahalanobis import chi_square, innovation_covariance, whitened_squares
 
 _PAIR = 1e6  # what one pairing more counts beside joint distances
 
@@ -86,10 +86,7 @@ def _extended(
     k, count = apart.shape[-1], apart.shape[-2]
     wide = h.flatten(1, 2).unsqueeze(1)  # [R, 1, L d, e]
     spread = (wide @ now.covariance).unflatten(2, (count, k))
-    others = h.unsqueeze(1)
-    s = [[(spread[..., i, :] * others[..., j, :]).sum(-1) for j in range(i + 1)] for i in range(k)]
-    for i in range(k):
-        s[i][i] = s[i][i] + variance
+    s = innovation_covariance(spread, h.unsqueeze(1), [variance] * k)
     shift = (wide @ now.delta.unsqueeze(-1))[..., 0].unflatten(2, (count, k))
     innovation = apart.unsqueeze(1) - shift  # [R, K, L, d]
     terms = whitened_squares(innovation.unbind(-1), s)

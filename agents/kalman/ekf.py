@@ -32,11 +32,8 @@ from coloc_env.options import OpenShare, PositiveCount
 from coloc_env.scenario import Believed
 from coloc_env.sensors import UnlabelledLandmarks
 
-_OTHERS = {
-    "fusion",
-    "second_order",
-    "association",
-}  # options that the exchange of measurements has not
+# Options that the exchange of measurements has not.
+_OTHERS = {"fusion", "second_order", "association"}
 FusionName = Literal["naive", "ci", "pairwise", "exchange"]
 
 

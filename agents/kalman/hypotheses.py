@@ -58,8 +58,7 @@ def merged(
 ) -> Float64[Tensor, "B N K"]:
     """Log-weights after hypotheses have gone over to a likelier one whose pose is the same: closer
     than half a standard deviation per direction by the likelier one's covariance."""
-    turn = process.attitude_error
-    pose = [*range(process.dim), *([] if turn is None else range(turn.start, turn.stop))]
+    pose = process.pose_errors
     k = log_weights.shape[-1]
     wide = (*state.shape[:2], k, k, state.shape[-1])
     apart = process.boxminus(state.unsqueeze(3).expand(wide), state.unsqueeze(2).expand(wide))

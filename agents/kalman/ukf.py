@@ -131,9 +131,6 @@ class UnscentedFilter(GaussianFilter):
         """Σ wᵢ xᵢ yᵢᵀ."""
         return x.mT @ (self.weights.to(y.device).unsqueeze(-1) * y)
 
-    def _position(self, covariance: Float[Tensor, "B N E E"]) -> Float[Tensor, "B N d d"]:
-        return covariance[..., : self.process.dim, : self.process.dim]
-
     def _innovations(
         self, prior: Prediction, models: Sequence[Measurement], neighbours: Neighbours
     ) -> tuple[Float[Tensor, "B N M K"], Float[Tensor, "B N K"]]:
@@ -149,6 +146,7 @@ class UnscentedFilter(GaussianFilter):
             variance = block.total_variance.expand_as(block.residual)[:, :, 0]  # about the mean
             if block.stray:  # between sigma points it may be anything
                 at_mean = model.linearize(self.process, prior.state, prior.observation, neighbours)
-                variance = at_mean.curved(self._position(prior.covariance)).total_variance
+                d = self.process.dim
+                variance = at_mean.curved(prior.covariance[..., :d, :d]).total_variance
             variances.append(variance.masked_fill(absent[:, :, 0], 1.0).flatten(-2))
         return torch.cat(residuals, -1), torch.cat(variances, -1)

@@ -26,10 +26,10 @@ def whitened_squares(
     Components apart: for the few that a measurement has, hundreds of solves become some twenty
     products, and no number depends on how many others are computed beside it.
     """
-    return _eliminated(residual, covariance)[0]
+    return eliminated(residual, covariance)[0]
 
 
-def _eliminated(
+def eliminated(
     residual: Sequence[Float[Tensor, "*#s"]], covariance: Sequence[Sequence[Float[Tensor, "*#s"]]]
 ) -> tuple[list[Float[Tensor, "*s"]], list[Float[Tensor, "*s"]]]:
     """``whitened_squares``' terms, and the pivots D, whose product is |S|."""
@@ -58,9 +58,19 @@ def innovation_terms(
 ) -> tuple[list[Float[Tensor, "B N m"]], list[Float[Tensor, "B N m"]]]:
     """Of each innovation r and its S = H P Hᵀ + R: k terms whose sum is rᵀ S⁻¹ r, and k numbers
     whose product is |S|."""
-    h, r = block.jacobian, block.residual.unbind(-1)
-    spread = h @ covariance.unsqueeze(-3)
-    s = [[(spread[..., i, :] * h[..., j, :]).sum(-1) for j in range(i + 1)] for i in range(len(r))]
-    for i, noise in enumerate(block.total_variance.unbind(-1)):
+    h = block.jacobian
+    s = innovation_covariance(h @ covariance.unsqueeze(-3), h, block.total_variance.unbind(-1))
+    return eliminated(block.residual.unbind(-1), s)
+
+
+def innovation_covariance(
+    spread: Float[Tensor, "*s k E"],
+    h: Float[Tensor, "*#s k E"],
+    variances: Sequence[Float[Tensor, "*#s"] | float],
+) -> list[list[Float[Tensor, "*s"]]]:
+    """The lower triangle of S = H P Hᵀ + R, components apart, from H P (``spread``)."""
+    size = range(len(variances))
+    s = [[(spread[..., i, :] * h[..., j, :]).sum(-1) for j in range(i + 1)] for i in size]
+    for i, noise in enumerate(variances):
         s[i][i] = s[i][i] + noise
-    return _eliminated(r, s)
+    return s

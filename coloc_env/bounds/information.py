@@ -90,7 +90,7 @@ def _landmarks(
     correct = 1 - others * (sensor.count - 1)
     expected = (correct - others) * visible + others * visible.sum(-1, keepdim=True)
     _, jacobian = _relative(truth, _points(seen, "landmark_map", truth))
-    return _gram(jacobian, expected / max(sensor.std, EXACT) ** 2)
+    return gram(jacobian, expected / max(sensor.std, EXACT) ** 2)
 
 
 @own_information.register
@@ -101,7 +101,7 @@ def _landmark_bearings(
     count = _mask(seen, "landmark_bearing_mask").unflatten(-1, (sensor.depth, -1)).sum(-2)
     apart, jacobian = _relative(truth, _points(seen, "landmark_map", truth))
     polar = _polar_jacobian(apart, sensor.range_std, sensor.bearing_std) @ jacobian
-    return _gram(polar, count)
+    return gram(polar, count)
 
 
 @own_information.register
@@ -110,7 +110,7 @@ def _anchor_ranging(
 ) -> Float64[Tensor, "B N D D"]:
     """d = ‖p + R l_a − A_m‖ + noise, for own tag a and anchor m."""
     rows, weights = anchor_rows(sensor, truth, seen)
-    return _gram(rows.unsqueeze(-2), weights)
+    return gram(rows.unsqueeze(-2), weights)
 
 
 def anchor_rows(
@@ -119,17 +119,15 @@ def anchor_rows(
     """Derivatives of each range by the pose, and its information, 0 where none arrived."""
     arrived = _mask(seen, "anchor_range_mask").unflatten(-1, (sensor.n_tags, -1))
     tags, jacobian = _tags(truth, sensor.tags)
-    toward = _unit(tags.unsqueeze(-2) - _points(seen, "anchor_map", truth).unsqueeze(2))
-    rows = toward @ jacobian  # [B, N, T, A, D]
+    tags, anchors = tags.unsqueeze(-2), _points(seen, "anchor_map", truth).unsqueeze(2)
+    rows = _unit(tags - anchors) @ jacobian  # [B, N, T, A, D]
     each = torch.full_like(arrived[0, 0, 0], range_information(sensor.noise))
     if sensor.sight.walls:
-        anchors = _points(seen, "anchor_map", truth).unsqueeze(2)
-        each = each * _through(sensor.noise, sensor.sight, tags.unsqueeze(-2), anchors)
+        each = each * _through(sensor.noise, sensor.sight, tags, anchors)
     if sensor.blocked:
         each[..., list(sensor.blocked)] = range_information(replace(sensor.noise, nlos=1.0))
     if sensor.noise.per_metre:
-        points = _points(seen, "anchor_map", truth).unsqueeze(2)
-        each = distance_information(sensor.noise, (tags.unsqueeze(-2) - points).norm(dim=-1))
+        each = distance_information(sensor.noise, (tags - anchors).norm(dim=-1))
     weights = arrived * each
     return rows.flatten(2, 3), weights.flatten(2)
 
@@ -148,7 +146,7 @@ def _tdoa(sensor: Tdoa, truth: Kinematics, seen: Observation) -> Float64[Tensor,
     each = 1 / std**2
     if sensor.tail:
         each = range_information(RangeNoise(std, tail=sensor.tail, tail_std=sensor.tail_std))
-    return _gram(rows.flatten(2, 3).unsqueeze(-2), (count * each).flatten(2))
+    return gram(rows.flatten(2, 3).unsqueeze(-2), (count * each).flatten(2))
 
 
 @own_information.register
@@ -160,7 +158,7 @@ def _position_fix(
     pose = torch.eye(dim, 6 if dim == 3 else 3, dtype=torch.float64, device=truth.position.device)
     rows = pose.unsqueeze(1).expand(*truth.position.shape[:2], -1, -1, -1)
     variance = pose.new_tensor([max(std, EXACT) ** 2 for std in sensor.axis_std(dim)])
-    return _gram(rows, _mask(seen, "position_fix_mask") / variance)
+    return gram(rows, _mask(seen, "position_fix_mask") / variance)
 
 
 @own_information.register
@@ -168,7 +166,7 @@ def _height(sensor: Height, truth: Kinematics, seen: Observation) -> Float64[Ten
     """z = p_z + N(0, σ²)."""
     row = truth.position.new_zeros(*truth.position.shape[:2], 1, 1, 6)
     row[..., 2] = 1.0
-    return _gram(row, _mask(seen, "height_mask") / max(sensor.std, EXACT) ** 2)
+    return gram(row, _mask(seen, "height_mask") / max(sensor.std, EXACT) ** 2)
 
 
 @motion_information.register
@@ -179,7 +177,7 @@ def _flow(sensor: OpticalFlow, truth: Kinematics, seen: Observation) -> Float64[
     rows = velocity.new_zeros(*velocity.shape[:2], 1, 2, 9)
     rows[..., 0, :, 3:6] = _turn(velocity)[..., :2, :]
     rows[..., 0, :, 6:9] = rotation.mT[..., :2, :]
-    return _gram(rows, _mask(seen, "flow_mask") / max(sensor.std, EXACT) ** 2)
+    return gram(rows, _mask(seen, "flow_mask") / max(sensor.std, EXACT) ** 2)
 
 
 # ---------------------------------------------------------------- what ties two UAVs together
@@ -259,7 +257,7 @@ def between(
     other[..., :d] = -own[..., :d]  # only p_j − p_i matters, and the other's attitude not at all
     between = torch.einsum("bijxd,bij,bijxe->bidje", own, weights, other)
     joint = between + between.permute(0, 3, 4, 1, 2)
-    ends = _gram(own, weights) + _gram(other.transpose(1, 2), weights.transpose(1, 2))
+    ends = gram(own, weights) + gram(other.transpose(1, 2), weights.transpose(1, 2))
     joint.diagonal(dim1=1, dim2=3).add_(ends.movedim(1, -1))
     return joint
 
@@ -306,7 +304,7 @@ def _by_uav(slots: Float64[Tensor, "B N S k"], seen: Observation) -> Float64[Ten
     return slots.new_zeros(*slots.shape[:2], n, slots.shape[-1]).scatter_add(2, index, slots)
 
 
-def _gram(
+def gram(
     rows: Float64[Tensor, "B N M x D"], weights: Float64[Tensor, "B N M"]
 ) -> Float64[Tensor, "B N D D"]:
     """``Σ_m w_m H_mᵀ H_m``."""

@@ -14,12 +14,13 @@ from torch import Tensor
 
 from coloc_env.bounds.information import (
     between,
+    gram,
     own_information,
     seen_of_others,
     shared_information,
 )
 from coloc_env.bounds.mixture import EXACT
-from coloc_env.geometry import cross_matrix, rotation_matrix
+from coloc_env.geometry import rotation_matrix
 from coloc_env.motion import Kinematics
 from coloc_env.observation import Observation
 from coloc_env.sensors import Compass, Light, Magnetic, Rssi, UavRssi, Ultrasonic
@@ -31,7 +32,7 @@ def _compass(sensor: Compass, truth: Kinematics, seen: Observation) -> Float64[T
     """z = ψ(R) + N(0, σ²)."""
     _, by_turn = heading(rotation_matrix(truth.attitude))
     rows = torch.cat((torch.zeros_like(truth.position), by_turn), -1).unsqueeze(-2)
-    return _gram(rows, seen["compass_mask"].double() / max(sensor.std, EXACT) ** 2)
+    return gram(rows.unsqueeze(-2), seen["compass_mask"].double() / max(sensor.std, EXACT) ** 2)
 
 
 @own_information.register
@@ -41,7 +42,7 @@ def _rssi(sensor: Rssi, truth: Kinematics, seen: Observation) -> Float64[Tensor,
     points = seen["rssi_map"].double().unflatten(-1, (-1, d))
     _, gradient = sensor.loss.expected(truth.position.unsqueeze(-2), points)
     rows = torch.nn.functional.pad(gradient, (0, 3 if d == 3 else 1))
-    return _gram(rows, seen["rssi_mask"].double() / max(sensor.loss.std, EXACT) ** 2)
+    return gram(rows.unsqueeze(-2), seen["rssi_mask"].double() / max(sensor.loss.std, EXACT) ** 2)
 
 
 @shared_information.register
@@ -63,17 +64,15 @@ def _ultrasonic(
 ) -> Float64[Tensor, "B N D D"]:
     """z = t(p, R) + N(0, σ²)."""
     _, rows = sensor.expected(truth.position, rotation_matrix(truth.attitude))
-    return _gram(rows, seen["ultrasonic_mask"].double() / max(sensor.std, EXACT) ** 2)
+    return gram(rows.unsqueeze(-2), seen["ultrasonic_mask"].double() / max(sensor.std, EXACT) ** 2)
 
 
 @own_information.register
 def _magnetic(sensor: Magnetic, truth: Kinematics, seen: Observation) -> Float64[Tensor, "B N D D"]:
     """z = Rᵀ B(p) + N(0, σ² I)."""
     rotation = rotation_matrix(truth.attitude)
-    field, slope = sensor.field(truth.position)
-    turned = cross_matrix((rotation.mT @ field.unsqueeze(-1))[..., 0])  # [Rᵀ B]×
-    rows = torch.cat((rotation.mT @ slope, turned), -1)
-    return _gram(rows, seen["magnetic_mask"].double() / max(sensor.std, EXACT) ** 2)
+    rows = sensor.in_body_by_pose(*sensor.field(truth.position), rotation)
+    return gram(rows.unsqueeze(2), seen["magnetic_mask"].double() / max(sensor.std, EXACT) ** 2)
 
 
 @own_information.register
@@ -86,21 +85,8 @@ def _light(sensor: Light, truth: Kinematics, seen: Observation) -> Float64[Tenso
     intensity, gradient = sensor.intensity(apart)
     variance = sensor.variance(intensity).clamp_min(EXACT**2)
     by_size = 1 / variance + 2 * (sensor.share**2 * intensity / variance) ** 2
-    bright = _gram(torch.nn.functional.pad(-gradient, (0, 3)), there * by_size)
-    rotation = rotation_matrix(truth.attitude)
-    r = apart.norm(dim=-1, keepdim=True).clamp_min(EXACT)
-    seen_way = (apart / r) @ rotation  # u = Rᵀ v / r
-    along = seen_way.unsqueeze(-1) * seen_way.unsqueeze(-2)
-    eye = torch.eye(3, dtype=along.dtype, device=along.device)
-    by_place = (along - eye) @ rotation.mT.unsqueeze(-3) / r.unsqueeze(-1)
-    rows = torch.cat((by_place, cross_matrix(seen_way)), -1)  # [B, N, K, 3, 6]
+    bright = gram(torch.nn.functional.pad(-gradient, (0, 3)).unsqueeze(-2), there * by_size)
+    rows = sensor.direction_by_pose(apart, rotation_matrix(truth.attitude))
     kappa = 1 / sensor.angle_std**2
     across = kappa * (1 / math.tanh(kappa) - 1 / kappa)
-    return bright + _gram(rows.flatten(-3, -2), (across * there).repeat_interleave(3, -1))
-
-
-def _gram(
-    rows: Float64[Tensor, "B N M D"], weights: Float64[Tensor, "B N #M"]
-) -> Float64[Tensor, "B N D D"]:
-    """``Σ_m w_m h_m h_mᵀ``."""
-    return (rows.mT * weights.unsqueeze(-2)) @ rows
+    return bright + gram(rows, across * there)

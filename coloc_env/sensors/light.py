@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.geometry import cross, unrotate
+from coloc_env.geometry import cross, cross_matrix, unrotate
 from coloc_env.options import Group, PositiveCount, PositiveMetres, Quantity, Radians, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, squared_norm
 from coloc_env.sensors.sight import Sight
@@ -85,6 +85,22 @@ class Light(Sensor):
         gradient = beam.unsqueeze(-1) * (up - fade.unsqueeze(-1) * apart)
         return beam * below + self.ambient, gradient
 
+    def direction(
+        self, apart: Float[Tensor, "*s K 3"], rotation: Float[Tensor, "*s 3 3"]
+    ) -> Float[Tensor, "*s K 3"]:
+        """u = Rᵀ v / r by the vectors v = L − p (m, world) to lamps."""
+        return apart / _length(apart) @ rotation
+
+    def direction_by_pose(
+        self, apart: Float[Tensor, "*s K 3"], rotation: Float[Tensor, "*s 3 3"]
+    ) -> Float[Tensor, "*s K 3 6"]:
+        """Its derivatives by δp (world) and δθ (right): −Rᵀ (I − v vᵀ / r²) / r and [u]×."""
+        r = _length(apart)
+        way = apart / r
+        eye = torch.eye(3, dtype=way.dtype, device=way.device)
+        across = (way.unsqueeze(-1) * way.unsqueeze(-2) - eye) / r.unsqueeze(-1)
+        return torch.cat((rotation.mT.unsqueeze(-3) @ across, cross_matrix(way @ rotation)), -1)
+
     def variance(self, intensity: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
         """Of an intensity's noise, lx²."""
         return (self.share * intensity) ** 2 + self.floor**2
@@ -110,6 +126,11 @@ class Light(Sensor):
             "light_direction": (directions * mask.unsqueeze(-1)).flatten(-2),
             "light_mask": mask,
         }
+
+
+def _length(apart: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 1"]:
+    """Of vectors to lamps (m), never 0."""
+    return torch.linalg.vector_norm(apart, dim=-1, keepdim=True).clamp_min(1e-3)
 
 
 def scattered(

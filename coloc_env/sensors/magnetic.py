@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.geometry import unrotate
+from coloc_env.geometry import cross_matrix, unrotate
 from coloc_env.motion import Box
 from coloc_env.options import Count, Group, PositiveMetres, PositiveSeconds, Quantity, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
@@ -78,6 +78,16 @@ class Magnetic(Sensor):
     ) -> tuple[Float[Tensor, "*s 3"], Float[Tensor, "*s 3 3"]]:
         """The same by the team's map."""
         return self._interpolated(_drawn(self)[1], position)
+
+    @staticmethod
+    def in_body_by_pose(
+        field: Float[Tensor, "*s 3"],
+        slope: Float[Tensor, "*s 3 3"],
+        rotation: Float[Tensor, "*s 3 3"],
+    ) -> Float[Tensor, "*s 3 6"]:
+        """Derivatives of Rᵀ B by δp (world) and δθ (right), from B and ∂B/∂p."""
+        seen = (rotation.mT @ field.unsqueeze(-1))[..., 0]
+        return torch.cat((rotation.mT @ slope, cross_matrix(seen)), -1)
 
     def _interpolated(
         self, nodes: Float64[Tensor, "F 3"], position: Float[Tensor, "*s 3"]

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from agents.models.measurements.base import Block, Measurement, Neighbours, body_frame, noise_std
 from agents.models.process import Process
-from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import Light
 from coloc_env.sensors.base import usable
@@ -38,9 +37,7 @@ class Lamps(Measurement):
         lamps = observation["light_map"].to(x.dtype).unflatten(-1, (-1, 3))
         apart = lamps - x[..., None, :3]  # v
         intensity, gradient = self.sensor.intensity(apart)
-        r = torch.linalg.vector_norm(apart, dim=-1, keepdim=True).clamp_min(1e-3)
-        way = apart / r
-        seen = way @ rotation  # u = Rᵀ v / r
+        seen = self.sensor.direction(apart, rotation)  # u = Rᵀ v / r
         residual = z.to(x.dtype) - torch.cat((intensity.unsqueeze(-1), seen), -1)
         spread = self.sensor.variance(intensity).unsqueeze(-1)
         angle = x.new_full((), self.angle_variance).expand(*intensity.shape, 3)
@@ -48,10 +45,9 @@ class Lamps(Measurement):
         if derivatives:
             jacobian = x.new_zeros(*residual.shape, process.error_size)
             jacobian[..., 0, :3] = -gradient
-            eye = torch.eye(3, dtype=x.dtype, device=x.device)
-            across = (way.unsqueeze(-1) * way.unsqueeze(-2) - eye) / r.unsqueeze(-1)
-            jacobian[..., 1:, :3] = rotation.mT.unsqueeze(-3) @ across  # −Rᵀ (I − u uᵀ) / r
-            jacobian[..., 1:, turn] = cross_matrix(seen)
+            by_pose = self.sensor.direction_by_pose(apart, rotation)
+            jacobian[..., 1:, :3], jacobian[..., 1:, turn] = by_pose.split(3, -1)
+            r = torch.linalg.vector_norm(apart, dim=-1, keepdim=True).clamp_min(1e-3)
             bend = _INTENSITY * self.sensor.power / r**4
             curvature = torch.cat((bend, (_DIRECTION / r**2).expand_as(seen)), -1)
         return Block(

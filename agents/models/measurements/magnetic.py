@@ -5,7 +5,6 @@ from torch import Tensor
 
 from agents.models.measurements.base import Block, Measurement, Neighbours, body_frame, noise_std
 from agents.models.process import Process
-from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import Magnetic
 from coloc_env.sensors.base import usable
@@ -40,8 +39,8 @@ class MappedFields(Measurement):
         jacobian, curvature = x.new_zeros(0), None
         if derivatives:
             jacobian = x.new_zeros(*residual.shape, process.error_size)
-            jacobian[..., 0, :, :3] = rotation.mT @ slope
-            jacobian[..., 0, :, turn] = cross_matrix(seen)
+            by_pose = self.sensor.in_body_by_pose(field, slope, rotation)
+            jacobian[..., 0, :, :3], jacobian[..., 0, :, turn] = by_pose.split(3, -1)
             curvature = x.new_tensor(self.bend).expand_as(residual)
         lasting = max(1.0, 2 * self.sensor.map_time / process.dt)
         variance = noise_std(self.sensor.std) ** 2 + lasting * self.sensor.map_std**2

@@ -1,8 +1,9 @@
 """Received signal strength of access points and of other UAVs."""
 
 import math
+from dataclasses import replace
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from agents.models.measurements.base import Block, Measurement, Neighbours, noise_std
@@ -78,13 +79,9 @@ class UavStrengths(_Strengths):
     ) -> Block:
         points = neighbours.position
         block, by_place = self._block(process, x, observation, points, derivatives)
-        known: Bool[Tensor, "B N m"] = block.mask & neighbours.known
-        return Block(
-            residual=block.residual,
-            jacobian=block.jacobian,
-            variance=block.variance,
-            mask=known,
+        return replace(
+            block,
+            mask=block.mask & neighbours.known,
             partner=-by_place,
             partner_variance=(by_place**2 * neighbours.variance.unsqueeze(-2)).sum(-1),
-            curvature=block.curvature,
         )

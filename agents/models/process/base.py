@@ -75,6 +75,12 @@ class Process(ABC):
             covariance[..., e, e] = self._of_any_yaw(x, covariance[..., e, e])
         return x, covariance
 
+    @property
+    def pose_errors(self) -> list[int]:
+        """Where the errors of position and attitude stand among all."""
+        turn = self.attitude_error
+        return [*range(self.dim), *([] if turn is None else range(turn.start, turn.stop))]
+
     def _of_any_yaw(
         self, x: Float[Tensor, "*s S"], covariance: Float[Tensor, "*s t t"]
     ) -> Float[Tensor, "*s t t"]:

@@ -1,5 +1,8 @@
 """Graduated non-convexity and several starts, against scipy and the equations' own definition."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
@@ -8,7 +11,9 @@ from scipy.optimize import least_squares
 
 from agents import make
 from agents.swarm import weights
+from agents.swarm.confidence import GncConfidence
 from agents.swarm.gauss_newton import gauss_newton
+from agents.swarm.links import Links
 from agents.swarm.multi_start import best_of, starts_about
 from coloc_env import make_scenario
 
@@ -55,15 +60,9 @@ def test_three_of_seven_ranges_too_long() -> None:
     off[[1, 3, 5]] += torch.tensor([25.0, 18.0, 30.0])
     y, distance, fixed, nothing = _trilateration(off)
     mask = distance > 0
-    mu: list[torch.Tensor] = []
-
-    def graduated(residual: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        squared = (residual / STD).square() * mask
-        mu.append(weights.GRADUATION * mu[-1] if mu else weights.first_mu(squared))
-        uniform, shift = weights.uniform(residual, mask, STD)
-        return uniform * weights.truncated(squared, mu[-1]), shift
-
-    found = gauss_newton(y, distance, graduated, fixed, y, nothing, weights.GRADUATIONS)[0][0, 0]
+    inputs: Any = SimpleNamespace(links=Links(distance, mask))
+    graduated, iterations = GncConfidence(STD).schedule(inputs, 1)
+    found = gauss_newton(y, distance, graduated, fixed, y, nothing, iterations)[0][0, 0]
     ends, measured = CORNERS[inliers].numpy(), distance[0, 0, 1:][inliers].numpy()
     reference = least_squares(
         lambda p: (((ends - p) ** 2).sum(1) ** 0.5 - measured) / STD, PLACE.numpy() + 6.0
