@@ -14,9 +14,10 @@ from agents.particle.cloud import (
     normalized,
     systematic,
 )
-from agents.particle.filter import Foreseen, ParticleFilter, Particles, Renewal, refuse_biases
+from agents.particle.filter import ParticleFilter, Particles, refuse_biases
 from agents.particle.particle_count import alive, equal_log_weights
 from agents.particle.resampling import FLOOR, RESAMPLE, SHRINKAGE, Resampling, Weighed, per_error
+from agents.particle.update import Foreseen, Renewal
 from coloc_env import noise
 from coloc_env.options import Count
 from coloc_env.scenario import Believed

@@ -12,8 +12,9 @@ from agents.models.process import Process
 from agents.models.update import information, posterior
 from agents.particle.belief import Step, normal
 from agents.particle.cloud import Moments, moments, normalized
-from agents.particle.filter import Foreseen, ParticleFilter, Particles, refuse_biases
+from agents.particle.filter import ParticleFilter, Particles, refuse_biases
 from agents.particle.sampling import gaussian
+from agents.particle.update import Foreseen
 from coloc_env.options import Count, Quantity
 from coloc_env.scenario import Believed
 

@@ -14,8 +14,9 @@ from agents.models.measurements import per_state
 from agents.models.update import posterior
 from agents.particle.belief import ParticleBelief, Step, normal
 from agents.particle.cloud import select
-from agents.particle.filter import ParticleFilter, Particles, Updated, refuse_biases
+from agents.particle.filter import ParticleFilter, Particles, refuse_biases
 from agents.particle.likelihood import log_likelihood
+from agents.particle.update import Updated
 from agents.registry import NotServed
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation

@@ -22,12 +22,12 @@ PROFILED = ("ekf", "ekf_trust", "apf", "pfnn", "pf_trust")
 REST = "rest"
 _STEPS, _WARM_UP = 200, 20
 _FUNCTIONS = {  # where a name is looked up: what its time is called
-    "agents.particle.filter.normal": "noise",
+    "agents.particle.update.normal": "noise",
     "agents.particle.resampling.normal": "noise",
     "agents.particle.proposal.normal": "noise",
     "agents.particle.tempering.normal": "noise",
     "agents.particle.filter.received": "messages",
-    "agents.particle.filter.log_likelihood": "likelihood",
+    "agents.particle.update.log_likelihood": "likelihood",
     "agents.particle.resampling.moments": "moments",
     "agents.particle.proposal.moments": "moments",
     "agents.particle.tempering.moments": "moments",
@@ -39,7 +39,7 @@ _FUNCTIONS = {  # where a name is looked up: what its time is called
     "agents.particle.tempering.normalized": "weights",
     "agents.particle.tempering.effective_sample_size": "weights",
     "agents.particle.proposal.iterated_update": "Gaussian update",
-    "agents.particle.filter.draw": "proposal",
+    "agents.particle.update.draw": "proposal",
     "agents.particle.degeneracy.draw": "proposal",
     "agents.kalman.ekf.received": "messages",
     "agents.kalman.filter.predict": "prediction",
