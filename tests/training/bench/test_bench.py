@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from agents import LOCALIZERS, make
-from agents.particle import filter as particle_filter
 from agents.particle import resampling
+from agents.particle import update as particle_update
 from coloc_env.scenarios import make_scenario
 from training.bench.agents import TITLES, Task, tasks
 from training.bench.bench import NAMES, bench
@@ -81,8 +81,8 @@ def test_no_part_has_gone() -> None:
 def test_watching_leaves_everything_as_it_was() -> None:
     scenario = make_scenario("indoor-v0", n_uavs=2)
     localizer: Any = make("pfnn", scenario)
-    before = particle_filter.normal, resampling.moments, localizer.resampling.weigh
+    before = particle_update.normal, resampling.moments, localizer.resampling.weigh
     with _watching(localizer, Stopwatch()):
-        during = particle_filter.normal, resampling.moments, localizer.resampling.weigh
+        during = particle_update.normal, resampling.moments, localizer.resampling.weigh
     assert all(one is not other for one, other in zip(before, during, strict=True))
-    assert (particle_filter.normal, resampling.moments, localizer.resampling.weigh) == before
+    assert (particle_update.normal, resampling.moments, localizer.resampling.weigh) == before
