@@ -6,17 +6,13 @@ import warnings
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from agents.errors import NotServed
 from coloc_env import options
 from coloc_env.registry import Factory, Registry
 
 if TYPE_CHECKING:
     from agents.localizer import Localizer
     from coloc_env.scenario import Believed, Scenario
-
-
-class NotServed(ValueError):
-    """A team is one that a localizer cannot estimate: it measures nothing that it could use, say.
-    Raised where the localizer is built; no option or name is wrong."""
 
 
 LOCALIZERS = Registry(

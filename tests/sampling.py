@@ -19,6 +19,13 @@ def crossed(*factors: Iterable[Any], every: int) -> list[Any]:
     return cases
 
 
+def slowly(*cases: Any) -> list[Any]:
+    """Cases that are slow."""
+    return [
+        pytest.param(*(c if isinstance(c, tuple) else (c,)), marks=pytest.mark.slow) for c in cases
+    ]
+
+
 def first_fast(first: Any, *others: Any) -> list[Any]:
     """Cases of which all but the first are slow."""
-    return [first, *(pytest.param(one, marks=pytest.mark.slow) for one in others)]
+    return [first, *slowly(*others)]

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from training.pool import REPORT_EVERY, Outcome, U, Unit, WorkerDied, checked_outcome
 from training.threads import use_threads
+from training.units import REPORT_EVERY, Outcome, U, Unit, WorkerDied, checked_outcome
 
 _RETRIES = 3  # of a unit whose worker or machine dies
 _CONNECT = 5.0  # s that a cluster's address may take to answer

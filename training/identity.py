@@ -10,7 +10,7 @@ import hashlib
 import importlib.util
 import inspect
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -51,7 +51,7 @@ def weights_of(localizer: Localizer) -> str | None:
     return digest.hexdigest()[:12] if some else None
 
 
-@lru_cache
+@cache
 def _closure(first: tuple[Path, ...]) -> str:
     """Hash of files and of what they import, whatever the order."""
     found: dict[Path, str] = {}
@@ -61,13 +61,12 @@ def _closure(first: tuple[Path, ...]) -> str:
         if path not in found:
             found[path], imports = _read(path)
             left += imports
-    text = "\n".join(sorted(found.values()))
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return _hash("\n".join(sorted(found.values())))[:12]
 
 
-@lru_cache
+@cache
 def _read(path: Path) -> tuple[str, tuple[Path, ...]]:
-    """A file's code without its docstrings, and the project's files that it imports."""
+    """Hash of a file's code without its docstrings, and the project's files that it imports."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     imports = tuple(file for name in _imported(tree) for file in _files(name))
     for node in ast.walk(tree):
@@ -75,7 +74,11 @@ def _read(path: Path) -> tuple[str, tuple[Path, ...]]:
             first = node.body[0] if node.body else None
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 node.body = node.body[1:]
-    return ast.dump(tree), imports
+    return _hash(ast.dump(tree)), imports
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
@@ -93,7 +96,7 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from _imported(node)
 
 
-@lru_cache
+@cache
 def _files(name: str) -> tuple[Path, ...]:
     """The file of a module of this project; none for anything else. Imports nothing."""
     package, *rest = name.split(".")

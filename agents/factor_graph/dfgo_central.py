@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.factor_graph.chain import Chain, Smoothed, smooth
 from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
 from agents.models.measurements import Block, Neighbours, make_measurements
-from agents.registry import NotServed
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.association import AssociationName, associated
+from agents.errors import NotServed
 from agents.kalman.exchange import ExchangingEkf
 from agents.kalman.filter import Beside, GaussianBelief, GaussianFilter
 from agents.kalman.fusion import Fusion
@@ -25,7 +26,6 @@ from agents.models.biases import kept_share, reported
 from agents.models.measurements import Neighbours, make_measurements, received
 from agents.models.ordered_update import by_kind, pick
 from agents.models.update import Update, expanded_update, iterated_update
-from agents.registry import NotServed
 from agents.robust import Fixed, Prediction, RobustScreen, Screen, Trust
 from coloc_env.observation import Observation
 from coloc_env.options import OpenShare, PositiveCount

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, Considered, kept_share, reported
@@ -20,7 +21,6 @@ from agents.models.measurements.second_order import expanded
 from agents.models.ordered_update import Estimation, by_kind, ordered_update, pick
 from agents.models.process import make_process
 from agents.models.update import posterior
-from agents.registry import NotServed
 from agents.robust import Prediction, RobustScreen, Trust
 from agents.tensorclasses import build
 from coloc_env.observation import Observation

@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.dead_reckoning import DeadReckoning
 from agents.kalman.filter import GaussianBelief, elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
@@ -24,7 +25,6 @@ from agents.models.measurements import (
     no_neighbours,
 )
 from agents.models.process import Process
-from agents.registry import NotServed
 from agents.robust.huber import huber_weights
 from agents.tensorclasses import build
 from coloc_env.observation import Observation

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import Beside
 from agents.kalman.fusion import Fusion, Rows, Taken, gains_of, rows_of
 from agents.models.biases import kept_share
 from agents.models.measurements import Block, Measurement, Neighbours
 from agents.models.process import Process
-from agents.registry import NotServed
 from agents.robust import Prediction, Trust
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Neighbours, make_measurements, no_neighbours, received
@@ -18,7 +19,6 @@ from agents.particle.latent import WINDOW, LatentModel, unaccelerated
 from agents.particle.likelihood import log_likelihood
 from agents.particle.resampling import FLOOR, Resampling, per_error
 from agents.particle.tempering import tempered
-from agents.registry import NotServed
 from agents.robust import Trust
 from agents.tensorclasses import build
 from agents.weights import learned

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from agents.association import AssociationName, associated
 from agents.association.clutter import reach_volume
+from agents.errors import NotServed
 from agents.localizer import Estimate
 from agents.models.biases import reported
 from agents.models.measurements import make_measurements, no_neighbours, received
@@ -24,7 +25,6 @@ from agents.particle.cloud import Moments, moments
 from agents.particle.printed import PERTURB_STD, PrintedResampling, anywhere
 from agents.particle.resampling import FLOOR, Perturb, Resampling, padded, padded_weights
 from agents.particle.update import CloudUpdate, Proposal, Renewal
-from agents.registry import NotServed
 from agents.robust import RobustScreen, Screen, Trust
 from agents.robust.heavy_tails import mixture_log_density, student_log_density
 from agents.tensorclasses import build

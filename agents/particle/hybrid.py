@@ -12,12 +12,13 @@ from torch import Tensor
 
 from agents.bank import BankOptions, Trial
 from agents.bank.kalman_fallback import KalmanFallback
+from agents.errors import NotServed
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import AnchorRanges
 from agents.models.process import make_process
 from agents.particle.failure import Detector, Evidence, evidence
 from agents.particle.filter import ParticleFilter
-from agents.registry import NotServed, make_inner
+from agents.registry import make_inner
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed

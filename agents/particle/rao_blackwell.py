@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import elapsed
 from agents.models.measurements import per_state
 from agents.models.update import posterior
@@ -17,7 +18,6 @@ from agents.particle.cloud import select
 from agents.particle.filter import ParticleFilter, Particles, refuse_biases
 from agents.particle.likelihood import log_likelihood
 from agents.particle.update import Updated
-from agents.registry import NotServed
 from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.options import Count

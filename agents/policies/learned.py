@@ -11,7 +11,7 @@ from agents.localizer import Estimate, Localizer
 from agents.policies.actor import Actor
 from agents.weights import drawn_from, learned
 from agents.wrappers.correction import Correction
-from coloc_env.envs.actions import ActionMode
+from coloc_env.envs.action_mode import ActionMode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import (
@@ -18,7 +19,6 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import posterior
-from agents.registry import NotServed
 from agents.slam.joint import Joint, information
 from agents.tensorclasses import build
 from coloc_env.observation import Observation

@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.localizer import Estimate, Localizer
 from agents.models.process import drives
-from agents.registry import NotServed
 from agents.stdcl.features import GraphInputs, RunningMeans, graph_inputs, initial_means
 from agents.stdcl.feedback import FEEDBACKS, KAPPA, FeedbackKind
 from agents.stdcl.network import ConvolutionState, Correction, StGnn

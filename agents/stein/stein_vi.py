@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models import preintegration
@@ -21,7 +22,6 @@ from agents.models.preintegration import Preintegrated
 from agents.models.process import InertialProcess
 from agents.particle.belief import normal, own_keys
 from agents.particle.sampling import from_prior
-from agents.registry import NotServed
 from agents.stein.estimate import Manifold, map_estimate
 from agents.stein.landmarks import LandmarkFit, fit_landmarks
 from agents.stein.likelihood import Scale

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.localizer import Estimate, Localizer
 from agents.particle.belief import normal, uniform
-from agents.registry import NotServed
 from agents.stein.likelihood import Scale
 from agents.tensorclasses import build
 from coloc_env.geometry import poses_in, rotate, rotation_matrix

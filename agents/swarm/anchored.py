@@ -15,12 +15,12 @@ from jaxtyping import Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import make_measurements
 from agents.models.process import make_process
-from agents.registry import NotServed
 from agents.swarm import joint
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.centres import Centres

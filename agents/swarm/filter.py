@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from agents.errors import NotServed
 from agents.kalman.filter import elapsed
 from agents.localizer import Estimate, Localizer
 from agents.models.biases import Biases, reported
 from agents.models.measurements import UavRanges
 from agents.models.process import make_process
-from agents.registry import NotServed
 from agents.swarm import calibration, delays, ins_bias, joint, joint_bias, persistence, window
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, SolvedKind, Weights

@@ -32,7 +32,7 @@ from agents.tasks.observation import (
 from agents.tasks.options import SteeredTaskOptions, TaskOptions
 from agents.tasks.rules import Policy
 from coloc_env.commands import Commands
-from coloc_env.envs.actions import ActionMode, Leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
 from coloc_env.motion import Box
 from coloc_env.observation import Observation
 from coloc_env.options import require_known

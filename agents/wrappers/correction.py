@@ -15,7 +15,7 @@ from agents.models.measurements.vectors import Heights
 from agents.models.process import make_process
 from agents.registry import make
 from agents.wrappers.residuals import pulls, robust_statistics
-from coloc_env.envs.actions import ActionMode, Leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.fixes import fix_leaves, relative_fixes
 from coloc_env.observation import Observation, prior_action

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from coloc_env.envs.actions import ActionMode
+from coloc_env.envs.action_mode import ActionMode
 from coloc_env.scenario import Scenario
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Float32, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from coloc_env.envs.actions import ActionMode, Leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
 from coloc_env.envs.fixes import fix_leaves, next_attitude, relative_fixes
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed

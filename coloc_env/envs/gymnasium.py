@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from coloc_env.envs.action_checks import checked_arrays
-from coloc_env.envs.actions import ActionMode, chosen_leaves, make_mode
+from coloc_env.envs.action_mode import ActionMode
+from coloc_env.envs.actions import chosen_leaves, make_mode
 from coloc_env.envs.pettingzoo import CoLocParallelEnv
 from coloc_env.observation import box, flat_box, stack
 from coloc_env.scenario import Scenario

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from coloc_env.commands import Commands
-from coloc_env.envs.actions import ActionMode, Leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
 from coloc_env.world import Step, World
 
 

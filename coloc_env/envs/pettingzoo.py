@@ -12,7 +12,8 @@ from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from coloc_env.envs.action_checks import checked_arrays
-from coloc_env.envs.actions import ActionMode, Leaves, action_space, make_mode, observed_leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
+from coloc_env.envs.actions import action_space, make_mode, observed_leaves
 from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.observation import all_leaves, box, flat_box, observation_space
 from coloc_env.render import Renderer

@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from torch import Tensor
 
 from coloc_env.envs.action_checks import checked_tensor
-from coloc_env.envs.actions import ActionMode, action_space, chosen_leaves, make_mode
+from coloc_env.envs.action_mode import ActionMode
+from coloc_env.envs.actions import action_space, chosen_leaves, make_mode
 from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.observation import flat_box
 from coloc_env.render import Renderer

@@ -10,7 +10,8 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coloc_env.envs.action_checks import checked_tensor
-from coloc_env.envs.actions import ActionMode, Leaves, chosen_leaves, make_mode, observed_leaves
+from coloc_env.envs.action_mode import ActionMode, Leaves
+from coloc_env.envs.actions import chosen_leaves, make_mode, observed_leaves
 from coloc_env.envs.mode_runner import ModeRunner
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import scenario_from

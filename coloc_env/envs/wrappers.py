@@ -7,7 +7,8 @@ import gymnasium as gym
 import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
-from coloc_env.envs.actions import ActionMode, chosen_leaves
+from coloc_env.envs.action_mode import ActionMode
+from coloc_env.envs.actions import chosen_leaves
 from coloc_env.envs.pettingzoo import CoLocParallelEnv
 from coloc_env.observation import flat_box
 

@@ -10,7 +10,8 @@ from coloc_env.sensors.errors.range_noise import NlosKind, RangeNoise, RangeOpti
 from coloc_env.sensors.height import BarometerOptions, Height
 from coloc_env.sensors.imu import GRAVITY, Imu, ImuOptions, RecordedImu, SimulatedImuOptions
 from coloc_env.sensors.ins import Ins, InsOptions
-from coloc_env.sensors.landmarks import LandmarkOptions, Landmarks
+from coloc_env.sensors.landmark_options import LandmarkOptions
+from coloc_env.sensors.landmarks import Landmarks
 from coloc_env.sensors.light import Light, LightOptions
 from coloc_env.sensors.magnetic import Magnetic, MagneticOptions
 from coloc_env.sensors.odometry import Odometry, RecordedOdometry

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -12,23 +12,14 @@ from torch import Tensor
 from coloc_env import noise
 from coloc_env.geometry import rotate, rotation_matrix
 from coloc_env.options import (
-    Count,
-    Group,
-    Metres,
-    PositiveMetres,
-    PositiveSeconds,
     Quantity,
-    Seconds,
-    Share,
 )
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require, usable
 from coloc_env.sensors.errors.persistence import held_uniform
 from coloc_env.sensors.sight import Sight
-from coloc_env.sensors.unlabelled_landmarks import UnlabelledLandmarks
 
 FieldOfView = Annotated[float, Quantity("rad", above=0.0, most=2 * math.pi)]
 Placement = Literal["random", "symmetric"]
-Association = Literal["known", "unknown"]
 
 
 def uniform_points(keys: Int64[Tensor, "R"], stream: str, count: int, layout: Layout) -> Tensor:
@@ -208,58 +199,3 @@ def _half_turned(points: Float64[Tensor, "R L d"], layout: Layout) -> Float64[Te
         first[:, -1, :2] = centre
     turned = torch.cat((2 * centre - first[..., :2], first[..., 2:]), -1)
     return torch.stack((first, turned), 2).flatten(1, 2)[:, : points.shape[1]]
-
-
-@dataclass(frozen=True)
-class LandmarkOptions(Group):
-    """So many ``landmarks`` stand anywhere in the arena (``landmark_placement``: ``random``, or
-    ``symmetric``: unchanged by half a turn about the arena's vertical axis); those within
-    ``landmark_radius`` m are seen as position vectors with noise of ``landmark_std`` m per axis.
-    With ``association=unknown`` nothing says which landmark a vector is to. A share
-    ``false_matches`` of these belongs to another landmark, in each step by chance or the same one
-    over ``alias_time`` s, a share ``landmark_dropout`` is missing, and in the times ``range_only``
-    (from, to) none is seen. ``landmark_field``: full opening angle of the cone about the body's x
-    axis in which they are seen (none: all around). The team believes the Gaussian part alone.
-    """
-
-    title: ClassVar[str] = "landmarks"
-
-    landmarks: Count = 20
-    landmark_std: Metres = 0.15
-    landmark_radius: PositiveMetres = 10.0
-    false_matches: Share = 0.0
-    landmark_dropout: Share = 0.0
-    range_only: tuple[Seconds, Seconds] | None = None
-    landmark_field: FieldOfView | None = None
-    association: Association = "known"
-    alias_time: PositiveSeconds | None = None
-    landmark_placement: Placement = "random"
-
-    @property
-    def true(self) -> tuple[Landmarks, ...]:
-        """The sensor as it is, by landmarks with names and with nothing in the way."""
-        wrong = self._seen(self.false_matches, self.landmark_dropout, self.range_only)
-        ahead, lasting, where = self.landmark_field, self.alias_time, self.landmark_placement
-        return tuple(
-            replace(one, field_of_view=ahead, alias_time=lasting, placement=where) for one in wrong
-        )
-
-    def behind(self, sight: Sight) -> tuple[Landmarks, ...]:
-        """The sensor as it is, with what hides landmarks."""
-        return tuple(replace(one, sight=sight) for one in self.true)
-
-    @property
-    def believed(self) -> tuple[Landmarks, ...]:
-        """The sensor that the team believes in, by landmarks with names."""
-        return self._seen()
-
-    def named(self, seen: tuple[Landmarks, ...]) -> tuple[Sensor, ...]:
-        """The landmarks as they are seen: with names, or without."""
-        if self.association == "known":
-            return seen
-        return tuple(UnlabelledLandmarks(one) for one in seen)
-
-    def _seen(self, *wrong: Any) -> tuple[Landmarks, ...]:
-        if not self.landmarks:
-            return ()
-        return (Landmarks(self.landmarks, self.landmark_std, self.landmark_radius, *wrong),)

@@ -1,18 +1,13 @@
 """Landmarks that look alike: what is seen, without which of them it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from jaxtyping import Int64
 from torch import Tensor
 
 from coloc_env import noise
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window
-
-if TYPE_CHECKING:
-    from coloc_env.sensors.landmarks import Landmarks
+from coloc_env.sensors.landmarks import Landmarks
 
 
 @dataclass(frozen=True)

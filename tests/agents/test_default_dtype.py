@@ -16,6 +16,7 @@ from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.motion import MOTIONS
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
+from tests.sampling import crossed
 
 SCENARIOS: dict[str, dict[str, Any]] = {
     "indoor-v0": {
@@ -49,7 +50,10 @@ CASES = [
 ]
 
 
-@pytest.fixture(params=[torch.float64, torch.float16], ids=["float64", "float16"])
+DTYPES = [torch.float64, torch.float16]
+
+
+@pytest.fixture(params=DTYPES, ids=str)
 def other(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     yield request.param
     torch.set_default_dtype(torch.float32)
@@ -83,7 +87,9 @@ def steps(scenario: str, agent: str | None, settings: dict[str, Any]) -> list[di
     return found
 
 
-@pytest.mark.parametrize(("scenario", "agent"), CASES)
+@pytest.mark.parametrize(
+    ("scenario", "agent", "other"), crossed(CASES, DTYPES, every=2), indirect=["other"]
+)
 def test_estimates_are_the_same(scenario: str, agent: str, other: torch.dtype) -> None:
     settings = SCENARIOS[scenario]
     expected = steps(scenario, agent, settings)

@@ -22,6 +22,7 @@ from training.reproduce.results import Results
 from training.reproduce.settings import Settings
 from training.reproduce.study import Part, Study, reproduce
 from training.reproduce.work import WORLD, Cell, Variant
+from training.units import WorkerDied
 
 STORE = 80 * 2**20  # bytes of a node's object store: Ray's least, nearly
 AGENTS = ("ekf", "pf500", "dead_reckoning")
@@ -144,7 +145,7 @@ def test_workers_and_nodes_that_die_are_replaced(cluster: Any, tmp_path: Path) -
 
     found = {one.unit.name: one for one in pool.work(units, workers(cluster), progress)}
     assert found.keys() == {unit.name for unit in units}
-    assert isinstance(found["always"].error, pool.WorkerDied)
+    assert isinstance(found["always"].error, WorkerDied)
     assert "\n" not in str(found["always"].error)
     assert isinstance(found["raises"].error, ZeroDivisionError)
     assert found["once"].error is None

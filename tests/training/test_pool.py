@@ -12,6 +12,7 @@ from units import Unit
 
 from training import pool
 from training.pool import Workers
+from training.units import WorkerDied
 
 
 def test_dead_processes_are_replaced_and_what_always_dies_is_reported(tmp_path: Path) -> None:
@@ -23,7 +24,7 @@ def test_dead_processes_are_replaced_and_what_always_dies_is_reported(tmp_path: 
     assert {one.unit for one in found} == set(units)
     failed = {one.unit.name: one.error for one in found if one.error is not None}
     assert failed.keys() == {"always", "b"}
-    assert isinstance(failed["always"], pool.WorkerDied)
+    assert isinstance(failed["always"], WorkerDied)
     assert str(failed["always"]) == "2 times (out of memory?)"
     assert isinstance(failed["b"], ZeroDivisionError)
     assert str(failed["b"]) == "by nothing"

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import torch
 
+from agents.errors import NotServed
 from agents.localizer import Localizer
-from agents.registry import NotServed
 from coloc_env.bounds import Bound
 from coloc_env.scenario import Scenario
 from coloc_env.seeding import checked_seed

@@ -15,7 +15,6 @@ from matplotlib.transforms import Bbox
 
 from coloc_env.render.style import GRID, INK, MUTED, uav_colours
 from training.evaluation import metrics
-from training.evaluation.files import FIGURES
 from training.evaluation.metrics import Flags, Floats
 from training.evaluation.results import Evaluation
 
@@ -48,7 +47,7 @@ _SHOWN = 100.0  # s of a run that a picture of trajectories shows at most
 _IN_PLAN, _IN_HEIGHT = 6, 3  # UAVs whose trajectories are drawn
 
 
-def draw(results: Evaluation, folder: Path, names: Sequence[str] = FIGURES) -> None:
+def draw(results: Evaluation, folder: Path, names: Sequence[str]) -> None:
     """Write all figures into a folder, by ``names`` whose endings say in which format."""
     drawings: Sequence[Callable[[Evaluation], Figure]] = (
         error_over_time,

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.registry import NotServed, make
+from agents.errors import NotServed
+from agents.registry import make
 from coloc_env.datasets import DATASETS, DataError, dataset_folder, sequences
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from agents.errors import NotServed
 from agents.models.measurements.angles import UavAngles
 from agents.models.measurements.base import (
     Block,
@@ -23,7 +24,6 @@ from agents.models.measurements.ranges import AnchorRanges, UavRanges
 from agents.models.measurements.rssi import SignalStrengths, UavStrengths
 from agents.models.measurements.ultrasonic import WallDistances
 from agents.models.measurements.vectors import Heights, LandmarkVectors, PositionFixes, Slowness
-from agents.registry import NotServed
 from coloc_env.scenario import (
     Believed,
     ConstantVelocity,

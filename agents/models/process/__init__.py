@@ -7,12 +7,12 @@ is always ``x[..., :d]``, velocity ``x[..., d:2d]`` and the position's error ``Î
 
 import math
 
+from agents.errors import NotServed
 from agents.models.process.base import Process
 from agents.models.process.constant_velocity import ConstantVelocityProcess
 from agents.models.process.drifting import DriftingProcess
 from agents.models.process.inertial import InertialProcess
 from agents.models.process.reckoned import DisplacementProcess, InsProcess, WheeledProcess
-from agents.registry import NotServed
 from coloc_env import scenario as believed_processes
 from coloc_env.scenario import Believed
 from coloc_env.sensors import Displacement, Height, Imu, Ins, Odometry, Sensor

@@ -17,7 +17,7 @@ from agents.association.candidates import Candidates
 from agents.association.clutter import CLUTTER, log_mixture
 from agents.association.joint import joint
 from agents.association.nearest import nearest
-from agents.registry import NotServed
+from agents.errors import NotServed
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
 

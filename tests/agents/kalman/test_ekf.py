@@ -161,6 +161,7 @@ def test_robust_weights_cost_little_without_trouble(robust: str, tools: SimpleNa
 # ---------------------------------------------------------------- what estimates have in common
 
 
+@pytest.mark.slow
 def test_intersection_stays_honest_without_landmarks(tools: SimpleNamespace) -> None:
     """Ten seconds on ranges alone: what goes round in messages is the same news again and again."""
     scenario = make_scenario("indoor-v0", range_only=(2.0, 12.0))

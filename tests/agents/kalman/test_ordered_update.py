@@ -38,6 +38,7 @@ def test_a_vague_prior_is_no_reason_to_distrust(name: str, tools: SimpleNamespac
     assert vague.rmse < 1.1 * near.rmse
 
 
+@pytest.mark.slow
 def test_a_blackout_leaves_the_team_honest(tools: SimpleNamespace) -> None:
     """20 s with ranges between UAVs alone, then landmarks again."""
     joint = found("ekf_joint", tools, 8, 500, range_only=(2.0, 22.0))

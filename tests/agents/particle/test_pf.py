@@ -28,8 +28,8 @@ def first(localizer: Localizer, scenario: Scenario, worlds: int = 2) -> tuple[An
 
 def test_the_room_is_localized_near_the_bound(tools: SimpleNamespace) -> None:
     scenario = make_scenario("indoor-v0")
-    found = tools.score("pf800", scenario, 10, 150)
-    assert 0.95 < found.rmse / posterior_bound(scenario, 10, 0, 150).rmse < 1.25
+    found = tools.score("pf800", scenario, 6, 120)
+    assert 0.95 < found.rmse / posterior_bound(scenario, 6, 0, 120).rmse < 1.25
     assert tools.consistent(found.nees, 3) > 0.7
     assert 2.3 < found.nees.mean() < 3.7
 

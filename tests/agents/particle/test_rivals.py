@@ -12,10 +12,10 @@ from filterpy.kalman import KalmanFilter
 from scipy.stats import multivariate_normal
 
 from agents import make
+from agents.errors import NotServed
 from agents.models.process import make_process
 from agents.particle import mixture
 from agents.particle.cloud import moments
-from agents.registry import NotServed
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from training.evaluation.record import record

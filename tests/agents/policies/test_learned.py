@@ -21,7 +21,7 @@ from agents.policies.adapters import LocalizerPolicy, ParallelPolicy
 from agents.policies.learned import PolicyAgent, actor_for, inputs_of, mode_of
 from agents.weights import card_of, write
 from agents.wrappers.correction import Correction
-from coloc_env.envs.actions import ActionMode
+from coloc_env.envs.action_mode import ActionMode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.pettingzoo import parallel_env
 from coloc_env.envs.torchrl import CoLocEnv, PerUavEnv

@@ -21,7 +21,8 @@ from torchrl.envs import check_env_specs
 
 from agents.wrappers.correction import with_base
 from coloc_env.envs.action_checks import checked_tensor
-from coloc_env.envs.actions import ActionMode, make_mode
+from coloc_env.envs.action_mode import ActionMode
+from coloc_env.envs.actions import make_mode
 from coloc_env.envs.displacement import Displacement
 from coloc_env.envs.fixes import fixes, relative_fixes
 from coloc_env.envs.mode_runner import ModeRunner

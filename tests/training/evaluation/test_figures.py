@@ -26,7 +26,7 @@ def bounded(results: Evaluation) -> Evaluation:
 @pytest.mark.filterwarnings("error")
 def test_all_figures(made_up: Evaluation, tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
-    draw(bounded(made_up), tmp_path)
+    draw(bounded(made_up), tmp_path, FIGURES)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FIGURES)
     for name in FIGURES:
         with Image.open(tmp_path / name) as image:
@@ -46,13 +46,13 @@ def test_one_step_one_run_one_agent(made_up: Evaluation, tmp_path: Path) -> None
     few = (agent.offset[:1, :1], agent.error[:1, :1], agent.nees[:1, :1], agent.broken[:1])
     scenario = dataclasses.replace(made_up.scenario, horizon=1)
     small = Evaluation(scenario, worlds, None, {"bad": RunRecord(worlds, *few)})
-    draw(small, tmp_path)
+    draw(small, tmp_path, FIGURES)
 
 
 def test_nothing_to_show(made_up: Evaluation, tmp_path: Path) -> None:
     nothing = np.zeros_like(made_up.worlds.scored)
     worlds = dataclasses.replace(made_up.worlds, scored=nothing)
-    draw(dataclasses.replace(made_up, worlds=worlds), tmp_path)
+    draw(dataclasses.replace(made_up, worlds=worlds), tmp_path, FIGURES)
 
 
 def test_lines_show_the_numbers(made_up: Evaluation) -> None:

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from coloc_env.datasets import DataError, Recording, Table, Track, load
 from coloc_env.datasets.recording import near_origin
 from coloc_env.scenarios import make_scenario
+from tests.sampling import slowly
 from training.cli.command import app
 from training.evaluation.evaluate import evaluate
 from training.evaluation.files import write
@@ -72,7 +73,7 @@ def spoil(path: Path, value: str) -> int:
     return count
 
 
-@pytest.mark.parametrize("value", ["-1", "0", "nan", "inf", "1e308", "1000"])
+@pytest.mark.parametrize("value", ["-1", "nan", "1000", *slowly("0", "inf", "1e308")])
 def test_one_range_in_five_is_none(labyrinth: Path, value: str, tmp_path: Path) -> None:
     data = str(tmp_path / "data")
     before = rmse(run("replay-tuc-v0", data=data))

@@ -264,7 +264,10 @@ def test_the_two_stages_and_the_cosine() -> None:
 
 @pytest.mark.parametrize(
     ("agent", "levels"),
-    [(f"{LOOP}:feedback=none", 3), ("stgat", 3), (LOOP, 0), ("stdcl:variant=paper", 2)],
+    [
+        ("stgat", 3),
+        *first_fast((f"{LOOP}:feedback=none", 3), (LOOP, 0), ("stdcl:variant=paper", 2)),
+    ],
 )
 def test_card_and_weights(
     agent: str, levels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

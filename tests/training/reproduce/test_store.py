@@ -206,16 +206,17 @@ def test_a_piece_depends_on_its_family_and_its_localizers(
     piece = Piece(Variant("x", "x", overrides, scenario, steps=3), (agent,), 0, 1)
     work._settings.cache_clear()
     before = piece.settings()["code"]
-    changed, read = Path(identity.__file__).parents[1] / file, Path.read_text
+    changed, read = Path(identity.__file__).parents[1] / file, identity._read
 
-    def with_change(path: Path, encoding: str | None = None) -> str:
-        return read(path, encoding) + ("\nCHANGED = 1\n" if path == changed else "")
+    def with_change(path: Path) -> tuple[str, tuple[Path, ...]]:
+        code, imports = read(path)
+        return code + ("CHANGED = 1" if path == changed else ""), imports
 
-    monkeypatch.setattr(Path, "read_text", with_change)
-    for cache in (work._settings, identity._read, identity._closure):
+    monkeypatch.setattr(identity, "_read", with_change)
+    for cache in (work._settings, identity._closure):
         cache.cache_clear()
     after = piece.settings()["code"]
-    for cache in (work._settings, identity._read, identity._closure):
+    for cache in (work._settings, identity._closure):
         cache.cache_clear()
     assert (after != before) == counts
 
