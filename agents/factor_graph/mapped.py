@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -16,6 +16,7 @@ from agents.factor_graph.condensed import Common, arrived, condensed, tie
 from agents.kalman.filter import gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import Block, LandmarkVectors, Neighbours, no_neighbours
+from agents.slam.start import first_seen, uniform
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.sensors import UnmappedLandmarks
@@ -53,35 +54,34 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         self.graph, self.process = graph, graph.process
         if self.process.attitude_error is None:
             raise NotServed("landmarks are in the body frame: the motion model has no attitude")
-        self.shares = graph.exchange == "local" and not graph.centralized
-        if self.shares and self.believed.slots != self.believed.arena.n_uavs:
+        self.shared = graph.exchange == "local" and not graph.centralized
+        if self.shared and self.believed.slots != self.believed.arena.n_uavs:
             raise NotServed("each UAV needs a slot for every other to share maps (exchange=local)")
         self.vectors, self.count = LandmarkVectors(sensor.landmarks), sensor.landmarks.count
         self.size = self.count * self.process.dim
 
     @property
     def exchanges(self) -> bool:
-        return self.shares or self.centralized
+        return self.shared or self.centralized
 
     def reset(self, observation: Observation) -> MappedBelief:
         track = self.graph.reset(observation)
         (b, n), d, x = track.step.shape, self.process.dim, track.prior
-        landmarks = self._middle(x).expand(b, n, self.count, d)
+        middle, variance = uniform(self.believed.arena, self.count, x)
+        landmarks = middle.view(self.count, d).expand(b, n, -1, -1)
         each = self.graph.size * d
-        sent = each + each**2 + each * self.size + self.size + self.size**2 if self.shares else 0
+        sent = each + each**2 + each * self.size + self.size + self.size**2 if self.shared else 0
         return MappedBelief(
             track=track.replace(sent=x.new_full((b, n, self.graph.age, sent), torch.nan)),
             landmarks=landmarks.clone(),
             before=landmarks.clone(),
-            precision=self._start(x).expand(b, n, -1, -1).clone(),
+            precision=(1 / variance).diag().expand(b, n, -1, -1).clone(),
             slope=x.new_zeros(b, n, self.process.error_size, self.size),
             found=torch.zeros(b, n, self.count, dtype=torch.bool, device=x.device),
             batch_size=(b, n),
         )
 
-    def step(
-        self, belief: MappedBelief, observation: Observation
-    ) -> tuple[MappedBelief, Estimate]:
+    def step(self, belief: MappedBelief, observation: Observation) -> tuple[MappedBelief, Estimate]:
         process, track = self.process, belief.track
         x, window, heard, leaves = self.graph.entered(track, observation)
         place, found = self._first_seen(belief, x[:, :, -1], observation)
@@ -92,7 +92,7 @@ class MappedFactorGraph(Localizer[MappedBelief]):
             place = place + self._map(solved.shared.mean)
         state, covariance = x[:, :, -1], self._newest(solved)
         sent = track.sent
-        if self.shares:
+        if self.shared:
             message = self._message(x, place, solved)
             state, covariance = self._tied(x, place, solved, track, leaves, observation)
             sent = torch.cat((sent[:, :, 1:], message.unsqueeze(2)), 2)
@@ -142,10 +142,9 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         """The graph, linearized about the window's states and the map; of each UAV or, centralized,
         of the team."""
         chain = self.graph.linearized(x, belief.track, leaves, heard)
-        map_leaves = leaves.leaves | {"landmark_map": place.flatten(-2).unsqueeze(2)}
-        block = self.vectors.linearize(
-            self.process, x, Observation(map_leaves), no_neighbours(x[..., : self.process.dim])
-        )
+        seen = Observation({**leaves.leaves, "landmark_map": place.flatten(-2).unsqueeze(2)})
+        nobody = no_neighbours(x[..., : self.process.dim])
+        block = self.vectors.linearize(self.process, x, seen, nobody)
         precision, border, about, vector, shared = self._landmarks(block)
         off = (belief.before - place).flatten(-2)
         slope, start = belief.slope, belief.precision
@@ -193,16 +192,11 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         """The map, with landmarks that are seen for the first time where they are, p + R z on the
         average of those that see them; and which are on it."""
         z, seen = self.vectors.read(observation, self.process.dim)
-        rotation = self.process.rotation(x)
-        assert rotation is not None
-        place = x[..., None, : self.process.dim] + z.double() @ rotation.mT
-        new = (seen & ~belief.found).unsqueeze(-1).double()
-        place, times = place * new, new
+        new, before = seen & ~belief.found, belief.landmarks
         if self.centralized:
-            place, times = (v.sum(1, keepdim=True).expand_as(v) for v in (place, times))
-            seen = seen.any(1, keepdim=True).expand_as(seen)
-        landmarks = torch.where(times > 0, place / times.clamp_min(1.0), belief.landmarks)
-        return landmarks, belief.found | seen
+            seen, before = seen.any(1, keepdim=True).expand_as(seen), before[:, :1]
+        place = first_seen(self.process, x, z, new, before)
+        return place.expand_as(belief.landmarks), belief.found | seen
 
     # ---------------------------------------------------------------- others' maps and tracks
 
@@ -233,11 +227,10 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         heard = (observation["message_mask"] > 0) & theirs.isfinite().all(-1).unsqueeze(1)
         theirs = torch.where(theirs.isfinite(), theirs, 0.0)
         maps, precision = theirs[..., :size], theirs[..., size:].unflatten(-1, (size, size))
-        start = self._start(x)
+        middle, variance = uniform(self.believed.arena, self.count, x)
+        start = (1 / variance).diag()
         # Λ ← Λ + Σ_j (Λ_j − Λ₀), η ← η + Σ_j (Λ_j m_j − Λ₀ m₀)
-        vector = (precision @ maps.unsqueeze(-1))[..., 0] - start @ self._middle(x).repeat(
-            self.count
-        )
+        vector = (precision @ maps.unsqueeze(-1))[..., 0] - middle / variance
         weight = heard.double()
         own = place.flatten(-2)
         added = torch.einsum("bij,bjkl->bikl", weight, precision - start)
@@ -263,16 +256,6 @@ class MappedFactorGraph(Localizer[MappedBelief]):
 
     # ---------------------------------------------------------------- parts
 
-    def _middle(self, like: Tensor) -> Float64[Tensor, "d"]:
-        arena = self.believed.arena
-        return 0.5 * (like.new_tensor(arena.low) + like.new_tensor(arena.high))
-
-    def _start(self, like: Tensor) -> Float64[Tensor, "M M"]:
-        """Information of a uniform position in the arena, for every landmark."""
-        arena = self.believed.arena
-        sides = like.new_tensor(arena.high) - like.new_tensor(arena.low)
-        return (12 / sides**2).repeat(self.count).diag()
-
     def _each(self, mean: Float64[Tensor, "*s W E"]) -> Float64[Tensor, "B N W E"]:
         """Each UAV's part of the states."""
         if not self.centralized:
@@ -293,4 +276,5 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         if not self.centralized:
             return covariance
         n, e = self.believed.arena.n_uavs, self.process.error_size
-        return covariance.unflatten(-1, (n, e)).unflatten(1, (n, e)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+        blocks = covariance.unflatten(-1, (n, e)).unflatten(1, (n, e))
+        return blocks.diagonal(dim1=1, dim2=3).movedim(-1, 1)

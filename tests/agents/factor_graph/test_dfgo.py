@@ -116,7 +116,8 @@ def test_ties_are_those_of_both_graphs_at_once() -> None:
     j, g = normal(1, 1, W, 1, 1, E, seed=7), normal(1, 1, W, 1, 1, d, seed=8)
     r, variance = normal(1, 1, W, 1, 1, seed=9), torch.full((1, 1, W, 1, 1), 0.3).double()
     mask = torch.tensor([True, True, False, True, True]).view(1, 1, W, 1)
-    tracks = Tracks(torch.zeros(1, 1, 1, W, d), other[..., :d, :d].unsqueeze(2), mask.mT)
+    none = torch.zeros(1, 1, 1, W, d, 0).double()
+    tracks = Tracks(none.sum(-1), other[..., :d, :d].unsqueeze(2), mask.mT, none)
 
     def linearize(delta: Tensor) -> list[Block]:
         moved = (j @ delta[:, :, :, None, :, None])[..., 0]
