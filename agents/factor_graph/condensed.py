@@ -116,10 +116,11 @@ def tie(
         innovation = torch.einsum("bnusme,bnuewtp->bnusmwtp", j, spread)
         innovation = innovation + torch.where(own, noise.unsqueeze(-2), 0.0)
         if common is not None:
-            k = j @ common.slope.unsqueeze(3) + g @ tracks.slope.transpose(2, 3)
+            k = torch.einsum("bnwsme,bnwel->bnwsml", j, common.slope)
+            k += torch.einsum("bnwsmd,bnswdl->bnwsml", g, tracks.slope)
             moved = torch.einsum("bnwsml,bnlk->bnwsmk", k, common.covariance)
-            spread = spread + torch.einsum("bnuek,bnwsmk->bnuewsm", common.slope, moved)
-            innovation = innovation + torch.einsum("bnusmk,bnwtpk->bnusmwtp", k, moved)
+            spread += torch.einsum("bnuek,bnwsmk->bnuewsm", common.slope, moved)
+            innovation += torch.einsum("bnusmk,bnwtpk->bnusmwtp", k, moved)
         total = innovation.flatten(5).flatten(2, 4) + torch.diag_embed(variance.flatten(2))
         ahead = r + (j @ delta[:, :, :, None, :, None])[..., 0]
         spread = spread.flatten(4).flatten(2, 3)  # [B, N, W·E, W·S·m]
