@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from agents.models.measurements import Block
-from agents.robust.huber import huber_weights
+from agents.robust import SoftName, widened
 from coloc_env.observation import Observation
 
 
@@ -86,7 +86,7 @@ def tie(
     joint: Float64[Tensor, "B N W W E E"],
     tracks: Tracks,
     linearize: Callable[[Float64[Tensor, "B N W E"]], Sequence[Block]],
-    robust: bool,
+    robust: SoftName,
     iterations: int = 2,
     common: Common | None = None,
 ) -> Tied:
@@ -131,7 +131,7 @@ def tie(
 
 
 def _by_slot(
-    block: Block, slots: int, robust: bool
+    block: Block, slots: int, robust: SoftName
 ) -> tuple[
     Float64[Tensor, "B N W S m E"],
     Float64[Tensor, "B N W S m d"],
@@ -141,9 +141,7 @@ def _by_slot(
     """J, G, r and the variances of a block whose measurements come as (…, slot, ``per_slot``); what
     was not measured has a row of zeros and variance 1."""
     assert block.partner is not None
-    variance = block.variance
-    if robust:
-        variance = variance / huber_weights(block).unsqueeze(-1)
+    variance = widened(robust, block)
     there = block.mask.unsqueeze(-1)
 
     def arranged(values: Tensor, otherwise: float) -> Tensor:

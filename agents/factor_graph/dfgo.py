@@ -21,8 +21,7 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import information
-from agents.robust import Trust
-from agents.robust.huber import huber_weights
+from agents.robust import SoftName, Trust, soft_trust
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
@@ -51,8 +50,9 @@ class SmootherBelief(TensorClass):
 class DistributedFactorGraph(Localizer[SmootherBelief]):
     """Fixed-lag smoother of each UAV over its last ``window`` steps, as a MAP estimate by
     Gauss–Newton (``iterations`` a step, from the last step's solution): IMU (or whatever the motion
-    model is driven by) between steps, Huber's loss (``robust=none``: squares) on landmarks, anchors
-    and ranges. Older steps are marginalized out.
+    model is driven by) between steps, landmarks, anchors and ranges by Huber's loss or (``robust``)
+    squares, or the likelihood of Student's t or of a mixture with wide tails. Older steps are
+    marginalized out.
 
     ``exchange=local``: a UAV sends the marginal of its window's positions from its own sensors
     alone, and ties its window to those it receives by the ranges in it; nothing counts twice.
@@ -71,12 +71,12 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         *,
         window: Annotated[int, Quantity("steps", 2, 200)] = 20,
         iterations: PositiveCount = 2,
-        robust: Literal["huber", "none"] = "huber",
+        robust: SoftName = "huber",
         exchange: Exchange = "local",
     ) -> None:
         super().__init__(believed)
         self.size, self.iterations = window, iterations
-        self.robust, self.exchange = robust == "huber", exchange
+        self.robust, self.exchange = robust, exchange
         self.process = make_process(believed)
         models = make_measurements(believed)
         self.own = [m for m in models if not m.cooperative or exchange == "all"]
@@ -211,7 +211,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         return process.boxminus(belief.prior, x[:, :, 0]), f, ahead, q
 
     def trust(self, block: Block) -> Trust:
-        return Trust(huber_weights(block)) if self.robust else Trust()
+        return soft_trust(self.robust, block)
 
     def _kept(self, observation: Observation) -> list[str]:
         """Leaves that are kept with a step."""

@@ -1,6 +1,6 @@
 """One factor graph of the whole team: the reference for UAVs that exchange condensed graphs."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float64
@@ -10,6 +10,7 @@ from agents.errors import NotServed
 from agents.factor_graph.chain import Chain, Smoothed, block_diagonal, smooth
 from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
 from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.robust import SoftName
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
@@ -31,7 +32,7 @@ class CentralFactorGraph(DistributedFactorGraph):
         *,
         window: Annotated[int, Quantity("steps", 2, 200)] = 20,
         iterations: PositiveCount = 4,
-        robust: Literal["huber", "none"] = "huber",
+        robust: SoftName = "huber",
     ) -> None:
         super().__init__(
             believed, window=window, iterations=iterations, robust=robust, exchange="none"

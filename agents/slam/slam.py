@@ -19,6 +19,7 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import posterior
+from agents.robust import SoftName
 from agents.slam.joint import Joint, information
 from agents.slam.start import first_seen, uniform
 from agents.tensorclasses import build
@@ -56,7 +57,7 @@ class Slam(Localizer[MapBelief]):
     is taken off. ``own``: maps stay where they are, and ranges to where neighbours say they are
     join the filter, as ``ekf`` has them.
 
-    ``robust=huber``: Huber's weights on all that is measured.
+    ``robust``: Huber's weights on all that is measured, or those of Student's t or of a mixture.
     """
 
     name = "slam"
@@ -68,7 +69,7 @@ class Slam(Localizer[MapBelief]):
         *,
         maps: Maps = "shared",
         iterations: PositiveCount = 3,
-        robust: Literal["none", "huber"] = "none",
+        robust: SoftName = "none",
     ) -> None:
         super().__init__(believed)
         sensor = believed.sensor(UnmappedLandmarks)
@@ -78,7 +79,7 @@ class Slam(Localizer[MapBelief]):
         if self.process.attitude_error is None:
             raise NotServed("landmarks are in the body frame: the motion model has no attitude")
         self.vectors, self.count = LandmarkVectors(sensor.landmarks), sensor.landmarks.count
-        self.iterations, self.robust = iterations, robust == "huber"
+        self.iterations, self.robust = iterations, robust
         self.shared = maps == "shared" and not self.centralized
         if (self.shared or self.centralized) and believed.slots != believed.arena.n_uavs:
             raise NotServed("each UAV needs a slot for every other, unless maps=own")

@@ -123,7 +123,7 @@ def test_ties_are_those_of_both_graphs_at_once() -> None:
         moved = (j @ delta[:, :, :, None, :, None])[..., 0]
         return [Block(r - moved, j, variance, mask, g, torch.zeros_like(variance))]
 
-    found = tie(sigma, tracks, linearize, robust=False)
+    found = tie(sigma, tracks, linearize, robust="none")
     flat = [x[0, 0].transpose(1, 2).reshape(W * k, W * k).numpy()
             for x, k in ((sigma, E), (other[..., :d, :d], d))]  # fmt: skip
     information = np.zeros((W * (E + d), W * (E + d)))

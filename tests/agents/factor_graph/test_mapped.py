@@ -117,7 +117,7 @@ def test_ties_of_tracks_that_share_a_map() -> None:
     block = Block(r, j, variance, mask, partner=g)
     linear = lambda delta: [replace(block, residual=r - (j @ delta[..., None, :, None])[..., 0])]  # noqa: E731
     common = Common(own.slopes, spread)
-    found = tie(own.states.joint(), tracks, linear, False, iterations=1, common=common)
+    found = tie(own.states.joint(), tracks, linear, "none", iterations=1, common=common)
 
     def wide(x: Tensor, size: int) -> np.ndarray:
         return x.reshape(W, W, size, size).transpose(1, 2).reshape(W * size, -1).numpy()
