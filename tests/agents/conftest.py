@@ -30,7 +30,7 @@ from coloc_env.sensors import (
     Sensor,
     UavBearings,
 )
-from coloc_env.world import World
+from coloc_env.world import World, steps_ahead
 
 SEEDS, STEPS, PARTICLES = (3, 4), 4, 33
 TAGS = (((0.2, 0.1, -0.1), (-0.3, 0.0, 0.1)),) * 3
@@ -249,9 +249,11 @@ def room(name: str, **overrides: Any) -> Scenario:
 
 
 def play(localizer: Localizer, scenario: Scenario, seeds: Iterable[int], steps: int) -> Run:
-    """A run in which the UAVs send their estimates as messages."""
+    """A run in which the UAVs send their estimates as messages. No step is sensed that is not
+    needed."""
     seeds = torch.tensor(list(seeds))
-    world = World(scenario, len(seeds))
+    window = steps_ahead(scenario, len(seeds), steps + 1)
+    world = World(scenario, len(seeds), window=window)
     observation = world.reset(seeds)
     run = Run([], [localizer.reset(observation)], [])
     for _ in range(steps):

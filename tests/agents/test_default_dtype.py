@@ -70,7 +70,7 @@ def assert_same(ours: list[dict[str, Tensor]], theirs: list[dict[str, Tensor]]) 
 def steps(scenario: str, agent: str | None, settings: dict[str, Any]) -> list[dict[str, Tensor]]:
     """Everything that a world and an agent give in four steps."""
     built = make_scenario(scenario, horizon=6, **settings)
-    world = World(built, 2)
+    world = World(built, 2, window=5)
     now, found = world.reset(3), []
     localizer: Any = make(agent, built) if agent else None
     belief = localizer.reset(now) if agent else None

@@ -317,7 +317,7 @@ def world_of(family: str, **overrides: Any) -> tuple[Any, ...]:
     """All that one world does in four steps, and what its team believes. UAVs that are steered are
     all sent one way; where they choose whom to call, UAV 0 calls 1, and 2 calls 3."""
     scenario = make_scenario(family, **SMALL.get(family, {}) | overrides)
-    world, n = World(scenario), scenario.arena.n_uavs
+    world, n = World(scenario, window=5), scenario.arena.n_uavs
     way = -torch.ones(1, n, scenario.arena.dim) if scenario.motion.steered else None
     calls = torch.full((1, n), SILENT)
     calls[0, :4:2] = torch.arange(1, n + 1)[: len(calls[0, :4:2]) * 2 : 2]
