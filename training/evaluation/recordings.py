@@ -145,17 +145,31 @@ def chosen_elsewhere(
             if agent not in CLASSICAL and "rmse" in by_agent[agent] and best < float("inf"):
                 ratio = float(np.log(by_agent[agent]["rmse"] / best))
                 ratios.setdefault(name.split("/")[0], {}).setdefault(agent, []).append(ratio)
+    means = {
+        dataset: {agent: float(np.mean(every)) for agent, every in here.items()}
+        for dataset, here in ratios.items()
+    }
+    return {
+        dataset: (agent, float(np.exp(means[dataset][agent])))
+        for dataset, agent in best_elsewhere(means).items()
+    }
+
+
+def best_elsewhere(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    """By dataset: whose mean score over all *other* datasets is least, of those that have one here.
+
+    Raises:
+        ValueError: there is but one dataset.
+    """
     found = {}
-    for dataset, here in ratios.items():
-        others = [one for other, one in ratios.items() if other != dataset]
+    for dataset, here in scores.items():
+        others = [one for other, one in scores.items() if other != dataset]
         if not others:
             raise ValueError(f"only {dataset} was measured: another dataset is needed to choose on")
-        scores = {
-            agent: float(np.mean([np.mean(one[agent]) for one in others if agent in one]))
-            for agent in here
+        elsewhere = {
+            name: float(np.mean([one[name] for one in others if name in one])) for name in here
         }
-        agent = min(scores, key=lambda name: scores[name])
-        found[dataset] = (agent, float(np.exp(np.mean(here[agent]))))
+        found[dataset] = min(elsewhere, key=lambda name: elsewhere[name])
     return found
 
 
