@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -122,18 +122,19 @@ def _constants(
     from coloc_env.staging import require_writable
     from training.evaluation import constants
 
-    if which not in ("bank", "biases"):
+    if which not in get_args(constants.Which):
         raise ValueError(f"--constants {which} is not allowed: bank or biases")
+    chosen = cast("constants.Which", which)
     datasets = None if only is None else only.split(",")
     require_known("dataset", datasets, DATASETS)
     require_writable(out)
     cut = {} if span is None else parse_overrides("replay-hanyang-v0", [f"span={span}"])
     with progress() as bars:
-        found = constants.measure(which, datasets, seed, bars, **cut)
+        found = constants.measure(chosen, datasets, seed, bars, **cut)
     command = f"coloc recordings --constants {which}"
     for name, value in (("only", only), ("span", span), ("seed", seed)):
         command += "" if value is None else f" --{name} {value}"
-    table = constants.table(which, found, command, "measured by this command")
+    table = constants.table(chosen, found, command, "measured by this command")
     _write(table, out)
     show(table["header"], table["rows"])
 
