@@ -29,14 +29,11 @@ def information(
     blocks: Sequence[Block], trusts: Sequence[Trust]
 ) -> tuple[Float[Tensor, "B N E E"], Float[Tensor, "B N E"]]:
     """Λ = Σ w Hᵀ R⁻¹ H and η = Σ w Hᵀ R⁻¹ r over all measurements of all blocks."""
-    rows, scaled, residuals = [], [], []
-    for block, trust in zip(blocks, trusts, strict=True):
-        h = block.jacobian.flatten(-3, -2)
-        rows.append(h)
-        scaled.append(h * trust.information(block).flatten(-2).unsqueeze(-1))
-        residuals.append(trust.residual(block).flatten(-2))
-    h, wh = torch.cat(rows, -2), torch.cat(scaled, -2)
-    r = torch.cat(residuals, -1)
+    pairs = list(zip(blocks, trusts, strict=True))
+    h = torch.cat([block.jacobian.flatten(-3, -2) for block in blocks], -2)
+    w = torch.cat([trust.information(block).flatten(-2) for block, trust in pairs], -1)
+    r = torch.cat([trust.residual(block).flatten(-2) for block, trust in pairs], -1)
+    wh = h * w.unsqueeze(-1)
     return h.mT @ wh, (wh.mT @ r.unsqueeze(-1))[..., 0]
 
 
@@ -64,8 +61,7 @@ def iterated_update(
     state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
     evidence, blocks, trusts = None, [], []
     first: list[Block] = []  # at the prior
-    broad = prior.broad(process.dim).unsqueeze(-1)
-    extra = screen.extra if bool(broad.any()) else 0
+    extra = screen.extra if screen.extra and bool(prior.broad(process.dim).any()) else 0
 
     known = covariance[..., : process.dim, : process.dim]
 
@@ -84,6 +80,7 @@ def iterated_update(
         delta, updated = posterior(covariance, precision, vector)
         state = process.boxplus(x, delta)
         if iteration < 0:  # extra iterations are for broad priors alone
+            broad = prior.broad(process.dim).unsqueeze(-1)
             delta, state = torch.where(broad, delta, 0.0), torch.where(broad, state, x)
     vague = prior.broad(process.dim, process.vague).unsqueeze(-1)
     if bool(vague.any()):
