@@ -88,3 +88,10 @@ def smooth(chain: Chain) -> Smoothed:
         covariances[k] = covariances[k] + c @ (covariances[k + 1] - predicted[k + 1][1]) @ c.mT
     second = predicted[min(1, w - 1)]
     return Smoothed(torch.stack(means, -2), torch.stack(covariances, -3), gain, *second)
+
+
+def block_diagonal(blocks: Float64[Tensor, "*s N a b"]) -> Float64[Tensor, "*s N*a N*b"]:
+    """The block-diagonal matrix."""
+    n = blocks.shape[-3]
+    own = torch.eye(n, dtype=blocks.dtype, device=blocks.device)[:, None, :, None]
+    return (blocks.unsqueeze(-2) * own).flatten(-2).flatten(-3, -2)

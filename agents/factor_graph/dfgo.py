@@ -1,7 +1,7 @@
 """Distributed factor-graph optimization: a fixed-lag smoother for each UAV, tied to its neighbours'
 by condensed graphs (DDF-SAM, Cunningham, Paluri & Dellaert 2010)."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from agents.factor_graph.chain import Chain, Smoothed, smooth
 from agents.factor_graph.condensed import arrived, condensed, tie
+from agents.factor_graph.mapped import MappedFactorGraph
 from agents.kalman.filter import elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
 from agents.models.measurements import (
@@ -20,12 +21,12 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import information
-from agents.robust import Trust
-from agents.robust.huber import huber_weights
+from agents.robust import SoftName, Trust, soft_trust
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
+from coloc_env.sensors import UnmappedLandmarks
 from coloc_env.sensors.base import Layout
 
 Exchange = Literal["local", "all", "none"]
@@ -49,13 +50,17 @@ class SmootherBelief(TensorClass):
 class DistributedFactorGraph(Localizer[SmootherBelief]):
     """Fixed-lag smoother of each UAV over its last ``window`` steps, as a MAP estimate by
     Gauss–Newton (``iterations`` a step, from the last step's solution): IMU (or whatever the motion
-    model is driven by) between steps, Huber's loss (``robust=none``: squares) on landmarks, anchors
-    and ranges. Older steps are marginalized out.
+    model is driven by) between steps, landmarks, anchors and ranges by Huber's loss or (``robust``)
+    squares, or the likelihood of Student's t or of a mixture with wide tails. Older steps are
+    marginalized out.
 
     ``exchange=local``: a UAV sends the marginal of its window's positions from its own sensors
     alone, and ties its window to those it receives by the ranges in it; nothing counts twice.
     ``all``: ranges to neighbours' estimates as they come join the window, so that what UAVs have in
     common counts again and again. ``none``: no ranges.
+
+    Landmarks that nobody knows (``landmarks_known=false``) are variables of the graph: see
+    ``MappedFactorGraph``.
     """
 
     name = "dfgo"
@@ -66,12 +71,12 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         *,
         window: Annotated[int, Quantity("steps", 2, 200)] = 20,
         iterations: PositiveCount = 2,
-        robust: Literal["huber", "none"] = "huber",
+        robust: SoftName = "huber",
         exchange: Exchange = "local",
     ) -> None:
         super().__init__(believed)
         self.size, self.iterations = window, iterations
-        self.robust, self.exchange = robust == "huber", exchange
+        self.robust, self.exchange = robust, exchange
         self.process = make_process(believed)
         models = make_measurements(believed)
         self.own = [m for m in models if not m.cooperative or exchange == "all"]
@@ -79,6 +84,16 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
         self.age = 1 + believed.message_delay
+
+    @classmethod
+    def for_team(cls, believed: Believed, **options: Any) -> Localizer[Any]:
+        """The smoother; among landmarks that nobody knows, the one that has them in its graph."""
+        graph, unmapped = cls(believed, **options), believed.sensor(UnmappedLandmarks)
+        return graph if unmapped is None else MappedFactorGraph(graph, unmapped)
+
+    @classmethod
+    def ignores(cls, believed: Believed) -> list[str]:
+        return [n for n in super().ignores(believed) if n != UnmappedLandmarks.__name__]
 
     @property
     def exchanges(self) -> bool:
@@ -106,13 +121,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         self, belief: SmootherBelief, observation: Observation
     ) -> tuple[SmootherBelief, Estimate]:
         process, step = self.process, belief.step
-        row = self._row(observation).unsqueeze(2)
-        window = torch.cat((belief.window[:, :, 1:], row), 2)
-        heard = torch.cat((belief.heard[:, :, 1:], self._heard(observation)), 2)
-        leaves = self._leaves(window, observation)
-        dt = elapsed(process, step).double()
-        newest = process.propagate(belief.states[:, :, -1], process.inputs(observation), dt)
-        x = torch.cat((belief.states[:, :, 1:], newest.unsqueeze(2)), 2)
+        x, window, heard, leaves = self.entered(belief, observation)
         for _ in range(self.iterations):
             at, found = x, self._solved(x, belief, leaves, heard)
             x = process.boxplus(x, found.mean)
@@ -139,6 +148,25 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
 
     # ---------------------------------------------------------------- own factors
 
+    def entered(
+        self, belief: SmootherBelief, observation: Observation
+    ) -> tuple[
+        Float64[Tensor, "B N W S"],
+        Float32[Tensor, "B N W F"],
+        Float64[Tensor, "B N W H"],
+        Observation,
+    ]:
+        """The window a step later: its states, the newest one predicted, what was sensed and heard
+        in it, and that as leaves."""
+        process = self.process
+        row = self._row(observation).unsqueeze(2)
+        window = torch.cat((belief.window[:, :, 1:], row), 2)
+        heard = torch.cat((belief.heard[:, :, 1:], self._heard(observation)), 2)
+        dt = elapsed(process, belief.step).double()
+        newest = process.propagate(belief.states[:, :, -1], process.inputs(observation), dt)
+        x = torch.cat((belief.states[:, :, 1:], newest.unsqueeze(2)), 2)
+        return x, window, heard, self._leaves(window, observation)
+
     def _solved(
         self,
         x: Float64[Tensor, "B N W S"],
@@ -147,13 +175,23 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         heard: Float64[Tensor, "B N W H"],
     ) -> Smoothed:
         """The window's graph, linearized about its states and solved."""
+        return smooth(self.linearized(x, belief, leaves, heard))
+
+    def linearized(
+        self,
+        x: Float64[Tensor, "B N W S"],
+        belief: SmootherBelief,
+        leaves: Observation,
+        heard: Float64[Tensor, "B N W H"],
+    ) -> Chain:
+        """The window's graph about its states."""
         blocks = [m.linearize(self.process, x, leaves, self._neighbours(heard)) for m in self.own]
         e = self.process.error_size
         precision, vector = x.new_zeros(*x.shape[:3], e, e), x.new_zeros(*x.shape[:3], e)
         if blocks:
-            precision, vector = information(blocks, [self._trust(block) for block in blocks])
+            precision, vector = information(blocks, [self.trust(block) for block in blocks])
         motion = self._steps(x, belief, leaves)
-        return smooth(Chain(motion[0], belief.prior_covariance, *motion[1:], precision, vector))
+        return Chain(motion[0], belief.prior_covariance, *motion[1:], precision, vector)
 
     def _steps(
         self, x: Float64[Tensor, "B N W S"], belief: SmootherBelief, leaves: Observation
@@ -172,8 +210,8 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         ahead = process.boxminus(process.propagate(x[:, :, :-1], u, dt), x[:, :, 1:])
         return process.boxminus(belief.prior, x[:, :, 0]), f, ahead, q
 
-    def _trust(self, block: Block) -> Trust:
-        return Trust(huber_weights(block)) if self.robust else Trust()
+    def trust(self, block: Block) -> Trust:
+        return soft_trust(self.robust, block)
 
     def _kept(self, observation: Observation) -> list[str]:
         """Leaves that are kept with a step."""

@@ -1,15 +1,16 @@
 """One factor graph of the whole team: the reference for UAVs that exchange condensed graphs."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from agents.errors import NotServed
-from agents.factor_graph.chain import Chain, Smoothed, smooth
+from agents.factor_graph.chain import Chain, Smoothed, block_diagonal, smooth
 from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
 from agents.models.measurements import Block, Neighbours, make_measurements
+from agents.robust import SoftName
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
 from coloc_env.scenario import Believed
@@ -31,7 +32,7 @@ class CentralFactorGraph(DistributedFactorGraph):
         *,
         window: Annotated[int, Quantity("steps", 2, 200)] = 20,
         iterations: PositiveCount = 4,
-        robust: Literal["huber", "none"] = "huber",
+        robust: SoftName = "huber",
     ) -> None:
         super().__init__(
             believed, window=window, iterations=iterations, robust=robust, exchange="none"
@@ -52,7 +53,7 @@ class CentralFactorGraph(DistributedFactorGraph):
         belief = super().reset(observation)
         b, n, e, _ = belief.prior_covariance.shape
         return belief.replace(
-            prior_covariance=_diagonal(belief.prior_covariance).view(b, n, e, n * e)
+            prior_covariance=block_diagonal(belief.prior_covariance).view(b, n, e, n * e)
         )
 
     def _solved(
@@ -63,6 +64,26 @@ class CentralFactorGraph(DistributedFactorGraph):
         heard: Float64[Tensor, "B N W 0"],
     ) -> Smoothed:
         """The team's graph; of the result each UAV's part."""
+        n, e = x.shape[1], self.process.error_size
+        found = smooth(self.linearized(x, belief, leaves, heard))
+        blocks_of = found.covariance[:, -1:].unflatten(-1, (n, e)).unflatten(-3, (n, e))
+        own = blocks_of.diagonal(dim1=2, dim2=4).movedim(-1, 1)  # [B, N, 1, E, E]
+        return Smoothed(
+            found.mean.unflatten(-1, (n, e)).transpose(1, 2),
+            own,
+            found.gain,
+            found.next_mean.unflatten(-1, (n, e)),
+            found.next_covariance.unflatten(1, (n, e)),
+        )
+
+    def linearized(
+        self,
+        x: Float64[Tensor, "B N W S"],
+        belief: SmootherBelief,
+        leaves: Observation,
+        heard: Float64[Tensor, "B N W 0"],
+    ) -> Chain:
+        """The team's graph about its states, as one chain of joint states."""
         b, n, w, _ = x.shape
         e, d = self.process.error_size, self.process.dim
         place = x[:, None, ..., :d].expand(-1, n, -1, -1, -1).transpose(2, 3)  # [B, N, W, N, d]
@@ -75,25 +96,14 @@ class CentralFactorGraph(DistributedFactorGraph):
             precision = precision + weighted @ h
             vector = vector + (weighted @ residual.unsqueeze(-1))[..., 0]
         mean, f, offset, q = self._steps(x, belief, leaves)
-        found = smooth(
-            Chain(
-                mean.flatten(1),
-                belief.prior_covariance.flatten(1, 2),
-                _diagonal(f.transpose(1, 2)),
-                offset.transpose(1, 2).flatten(2),
-                _diagonal(q.transpose(1, 2)),
-                precision,
-                vector,
-            )
-        )
-        blocks_of = found.covariance[:, -1:].unflatten(-1, (n, e)).unflatten(-3, (n, e))
-        own = blocks_of.diagonal(dim1=2, dim2=4).movedim(-1, 1)  # [B, N, 1, E, E]
-        return Smoothed(
-            found.mean.unflatten(-1, (n, e)).transpose(1, 2),
-            own,
-            found.gain,
-            found.next_mean.unflatten(-1, (n, e)),
-            found.next_covariance.unflatten(1, (n, e)),
+        return Chain(
+            mean.flatten(1),
+            belief.prior_covariance.flatten(1, 2),
+            block_diagonal(f.transpose(1, 2)),
+            offset.transpose(1, 2).flatten(2),
+            block_diagonal(q.transpose(1, 2)),
+            precision,
+            vector,
         )
 
     def _rows(
@@ -107,7 +117,7 @@ class CentralFactorGraph(DistributedFactorGraph):
         h = block.jacobian.new_zeros(b, n, w, m, k, n, e)
         own = torch.arange(n, device=h.device)
         h[:, own, :, :, :, own] = block.jacobian.movedim(1, 0)
-        weight = self._trust(block).information(block)
+        weight = self.trust(block).information(block)
         if block.partner is not None:  # measurements come as (…, slot, per slot), slot j is UAV j
             by_slot = h.unflatten(3, (-1, n, block.per_slot))
             partner = block.partner.unflatten(3, (-1, n, block.per_slot))
@@ -117,10 +127,3 @@ class CentralFactorGraph(DistributedFactorGraph):
         rows = h.transpose(1, 2).flatten(5).flatten(2, 4)
         weight, residual = (v.transpose(1, 2).flatten(2) for v in (weight, block.residual))
         return rows, weight, residual
-
-
-def _diagonal(blocks: Float64[Tensor, "*s N E E"]) -> Float64[Tensor, "*s N*E N*E"]:
-    """The block-diagonal matrix."""
-    n = blocks.shape[-3]
-    own = torch.eye(n, dtype=blocks.dtype, device=blocks.device)[:, None, :, None]
-    return (blocks.unsqueeze(-2) * own).flatten(-2).flatten(-3, -2)

@@ -5,7 +5,7 @@ happened before the window is forgotten, and so is any failure.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -25,7 +25,7 @@ from agents.models.measurements import (
     no_neighbours,
 )
 from agents.models.process import Process
-from agents.robust.huber import huber_weights
+from agents.robust import SoftName, widened
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
@@ -65,7 +65,8 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
     x̂ = (H̄ᵀ Ξ⁻¹ H̄)⁻¹ H̄ᵀ Ξ⁻¹ Z and P = (H̄ᵀ Ξ⁻¹ H̄)⁻¹, h linearized ``iterations`` times. It uses
     what the UAV measures itself and needs no prior but, where the motion model has an attitude (and
     biases), their dead reckoning. Where the window does not observe the state, P is large.
-    ``robust=huber`` widens the variance of what is far from the iterate it is linearized about.
+    ``robust`` widens the variance of what is far from the iterate it is linearized about: as Huber,
+    Student's t or a mixture with wide tails have it.
     """
 
     name = "emvf"
@@ -76,10 +77,10 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         *,
         memory: Annotated[int, Quantity("steps", 2, 1000)] = 3,
         iterations: PositiveCount = 4,
-        robust: Literal["none", "huber"] = "none",
+        robust: SoftName = "none",
     ) -> None:
         super().__init__(believed)
-        self.size, self.iterations, self.robust = memory, iterations, robust == "huber"
+        self.size, self.iterations, self.robust = memory, iterations, robust
         self.reckoning = DeadReckoning(believed)
         self.process: Process = self.reckoning.process
         self.models = [m for m in make_measurements(believed) if not m.cooperative]
@@ -246,9 +247,7 @@ class MinimumVarianceFir(Localizer[WindowBelief]):
         return jacobian, residual, variance
 
     def _rows(self, block: Block) -> tuple[Tensor, Tensor, Tensor]:
-        there, variance = block.mask.unsqueeze(-1), block.variance
-        if self.robust:
-            variance = variance / huber_weights(block).unsqueeze(-1)
+        there, variance = block.mask.unsqueeze(-1), widened(self.robust, block)
         residual = torch.where(there, block.residual, 0.0).flatten(-2)
         variance = torch.where(there, variance, 1.0).flatten(-2)
         jacobian = torch.where(there.unsqueeze(-1), block.jacobian, 0.0).flatten(-3, -2)

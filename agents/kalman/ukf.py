@@ -18,12 +18,13 @@ from agents.models.measurements import (
     received,
 )
 from agents.models.ordered_update import by_kind, pick
-from agents.robust import Prediction, Trust
+from agents.robust import Prediction, SoftName, Trust, soft_trust
 from coloc_env.observation import Observation
 from coloc_env.options import Quantity
 from coloc_env.scenario import Believed
 
 _BETA = 2.0  # the best for Gaussian errors
+_REWEIGHTED = 4  # updates of a prior: by plain variances, then by those at the state found
 
 Alpha = Annotated[float, Quantity("", 1e-2, 10.0)]
 
@@ -35,12 +36,23 @@ class UnscentedFilter(GaussianFilter):
     motion and in the updates: by the UAV's own measurements, then by those that involve neighbours
     (E: size of the error; ``alpha``: how far out points are; β = 2, κ = 0; van der Merwe 2004).
     Noise adds, as in ``ekf``. ``cooperate=false`` leaves other UAVs out.
+
+    ``robust``: Huber's weights or those of Student's t or of a mixture with wide tails, at the
+    updated state: the prior is updated again by them, three times.
     """
 
     name = "ukf"
 
-    def __init__(self, believed: Believed, *, alpha: Alpha = 1.0, cooperate: bool = True) -> None:
+    def __init__(
+        self,
+        believed: Believed,
+        *,
+        alpha: Alpha = 1.0,
+        cooperate: bool = True,
+        robust: SoftName = "none",
+    ) -> None:
         super().__init__(believed)
+        self.robust, self.iterations = robust, 1 if robust == "none" else _REWEIGHTED
         self.models = [m for m in make_measurements(believed) if cooperate or not m.cooperative]
         e, self.alpha = self.process.error_size, alpha
         first = 1 - 1 / alpha**2  # λ / (E + λ), λ = α² E − E
@@ -81,11 +93,16 @@ class UnscentedFilter(GaussianFilter):
         """x⁺ = x ⊞ K (z − ẑ), P⁺ = P − K S Kᵀ by some of the measurements."""
         residuals, variances = self._innovations(prior, models, neighbours)
         innovation, apart = self._centred(residuals)  # z − ẑ, and ẑ − h(xᵢ)
-        s = self._product(apart, apart) + torch.diag_embed(variances)
+        spread, noise = self._product(apart, apart), variances
         cross = -self._product(self._offsets(prior.covariance), apart)
-        gain = torch.linalg.solve(s, cross.mT).mT.contiguous()  # K = P_xz S⁻¹
-        delta = (gain * innovation.unsqueeze(-2)).sum(-1)
-        state = self.process.boxplus(prior.state, delta)
+        state = prior.state
+        for iteration in range(self.iterations):
+            if iteration:
+                noise = variances / self._weights(prior, state, models, neighbours)
+            s = spread + torch.diag_embed(noise)
+            gain = torch.linalg.solve(s, cross.mT).mT.contiguous()  # K = P_xz S⁻¹
+            delta = (gain * innovation.unsqueeze(-2)).sum(-1)
+            state = self.process.boxplus(prior.state, delta)
         covariance = prior.covariance - gain @ s @ gain.mT
         covariance = 0.5 * (covariance + covariance.mT)
         if self.biases:
@@ -101,6 +118,24 @@ class UnscentedFilter(GaussianFilter):
         if not any(model.cooperative for model in self.models):
             return {}
         return {"bytes": belief.state.new_full(belief.step.shape, 4 * 3 * self.process.dim)}
+
+    def _weights(
+        self,
+        prior: Prediction,
+        state: Float[Tensor, "B N S"],
+        models: Sequence[Measurement],
+        neighbours: Neighbours,
+    ) -> Float[Tensor, "B N K"]:
+        """What each number measured counts at a state; 1 where nothing was measured."""
+        weights = []
+        for model in models:
+            seen = prior.observation
+            block = model.linearize(self.process, state, seen, neighbours, derivatives=False)
+            weight = soft_trust(self.robust, block).weight
+            assert weight is not None
+            counted = torch.where(block.mask, weight, 1.0).unsqueeze(-1)
+            weights.append(counted.expand_as(block.residual).flatten(-2))
+        return torch.cat(weights, -1)
 
     # ---------------------------------------------------------------- the unscented transform
 

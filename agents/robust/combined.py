@@ -11,18 +11,12 @@ from agents.models.measurements import Block, Measurement
 from agents.models.process import Process
 from agents.robust.cross import CrossValidation
 from agents.robust.gate import gate_weights, residual_gate_weights
-from agents.robust.heavy_tails import mixture_weights, student_weights
-from agents.robust.huber import huber_weights
 from agents.robust.ransac import consensus_weights
 from agents.robust.screen import Prediction, Screen, Trust
+from agents.robust.soft import SOFT
 from agents.robust.temporal import TemporalConsistency
 from coloc_env.observation import Observation
 
-SOFT: dict[str, Callable[[Block], Float[Tensor, "B N m"]]] = {
-    "huber": huber_weights,
-    "student": student_weights,
-    "mixture": mixture_weights,
-}
 METHODS = (*SOFT, "gate", "ransac", "temporal", "cross")
 _STEP = 0.1  # what a step counts in the running share of measurements left out
 _MOST = 0.5  # the share beyond which it is not the measurements that are wrong

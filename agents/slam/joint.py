@@ -9,8 +9,7 @@ from torch import Tensor
 
 from agents.models.measurements import Block
 from agents.models.process import Process
-from agents.robust import Trust
-from agents.robust.huber import huber_weights
+from agents.robust import SoftName, soft_trust
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Joint:
 
 
 def information(
-    blocks: Sequence[Block], landmarks: Block, shape: tuple[int, int], robust: bool
+    blocks: Sequence[Block], landmarks: Block, shape: tuple[int, int], robust: SoftName
 ) -> tuple[Float64[Tensor, "B G M M"], Float64[Tensor, "B G M"]]:
     """Λ = Σ Hᵀ R⁻¹ H and η = Σ Hᵀ R⁻¹ r by the errors of groups of ``shape`` (G, n), from blocks of
     all UAVs. The derivative of z = Rᵀ(L − p) by L is minus that by p. What is measured of UAVs in
@@ -76,8 +75,7 @@ def information(
             by_landmark = h[..., n * e :].unflatten(-1, (count, d))
             own = -grouped[..., :d].movedim(-3, 0)  # [L, B, G, n, k, d]
             by_landmark[:, :, :, index, :, index] = own
-        trust = Trust(huber_weights(block)) if robust else Trust()
-        weight = trust.information(block)
+        weight = soft_trust(robust, block).information(block)
         if block.partner is not None and n > 1:
             spread = h.unflatten(3, (-1, n, block.per_slot))
             partner = block.partner.unflatten(1, shape).unflatten(3, (-1, n, block.per_slot))

@@ -19,7 +19,9 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import posterior
+from agents.robust import SoftName
 from agents.slam.joint import Joint, information
+from agents.slam.start import first_seen, uniform
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount
@@ -55,7 +57,7 @@ class Slam(Localizer[MapBelief]):
     is taken off. ``own``: maps stay where they are, and ranges to where neighbours say they are
     join the filter, as ``ekf`` has them.
 
-    ``robust=huber``: Huber's weights on all that is measured.
+    ``robust``: Huber's weights on all that is measured, or those of Student's t or of a mixture.
     """
 
     name = "slam"
@@ -67,7 +69,7 @@ class Slam(Localizer[MapBelief]):
         *,
         maps: Maps = "shared",
         iterations: PositiveCount = 3,
-        robust: Literal["none", "huber"] = "none",
+        robust: SoftName = "none",
     ) -> None:
         super().__init__(believed)
         sensor = believed.sensor(UnmappedLandmarks)
@@ -77,7 +79,7 @@ class Slam(Localizer[MapBelief]):
         if self.process.attitude_error is None:
             raise NotServed("landmarks are in the body frame: the motion model has no attitude")
         self.vectors, self.count = LandmarkVectors(sensor.landmarks), sensor.landmarks.count
-        self.iterations, self.robust = iterations, robust == "huber"
+        self.iterations, self.robust = iterations, robust
         self.shared = maps == "shared" and not self.centralized
         if (self.shared or self.centralized) and believed.slots != believed.arena.n_uavs:
             raise NotServed("each UAV needs a slot for every other, unless maps=own")
@@ -92,15 +94,15 @@ class Slam(Localizer[MapBelief]):
     def reset(self, observation: Observation) -> MapBelief:
         x, own = self.process.initial(observation["prior"].double())
         (b, n, _), e, d = x.shape, self.process.error_size, self.process.dim
-        low, high = (x.new_tensor(side) for side in (self.believed.arena.low, self._high))
-        landmarks = (0.5 * (low + high)).expand(b, n, self.count, d)
+        middle, unknown = uniform(self.believed.arena, self.count, x)
+        landmarks = middle.view(self.count, d).expand(b, n, -1, -1)
         size = self.count * d
         width = (n if self.centralized else 1) * e + size
         covariance = x.new_zeros(b, n, e + size, width)
         for i in range(n):
             first = i * e if self.centralized else 0
             covariance[:, i, :e, first : first + e] = own[:, i]
-        covariance[..., e:, -size:] = self._unknown(x).diag()
+        covariance[..., e:, -size:] = unknown.diag()
         sent = size + size**2 if self.shared else 0
         return MapBelief(
             state=x,
@@ -154,15 +156,6 @@ class Slam(Localizer[MapBelief]):
 
     # ---------------------------------------------------------------- parts
 
-    @property
-    def _high(self) -> tuple[float, ...]:
-        return self.believed.arena.high
-
-    def _unknown(self, like: Tensor) -> Float64[Tensor, "L*d"]:
-        """Variances (m²) of a uniform position in the arena, for every landmark."""
-        sides = like.new_tensor(self._high) - like.new_tensor(self.believed.arena.low)
-        return (sides**2 / 12).repeat(self.count)
-
     def _joint(self, belief: MapBelief, shape: tuple[int, int]) -> Joint:
         e = self.process.error_size
         rows = belief.covariance.unflatten(1, shape)
@@ -207,15 +200,9 @@ class Slam(Localizer[MapBelief]):
     ) -> Float64[Tensor, "B G M"]:
         """Errors δ that put landmarks seen for the first time where they are seen, p + R z on the
         average; 0 for all else."""
-        x, (groups, n) = prior.state.flatten(1, 2), prior.state.shape[1:3]
         z, seen = self.vectors.read(observation, self.process.dim)
-        rotation = self.process.rotation(x)
-        assert rotation is not None
-        place = x[..., None, : self.process.dim] + z.double() @ rotation.mT
-        new = (seen & ~found).unflatten(1, (groups, n)).unsqueeze(-1).double()
-        total = (place.unflatten(1, (groups, n)) * new).sum(2)
-        times = new.sum(2)
-        moved = torch.where(times > 0, total / times.clamp_min(1.0) - prior.landmarks, 0.0)
+        x = prior.state.flatten(1, 2)
+        moved = first_seen(self.process, x, z, seen & ~found, prior.landmarks) - prior.landmarks
         delta = prior.covariance.new_zeros(prior.covariance.shape[:-1])
         delta[..., -moved[0, 0].numel() :] = moved.flatten(-2)
         return delta
@@ -235,13 +222,11 @@ class Slam(Localizer[MapBelief]):
         size, e = self.count * self.process.dim, self.process.error_size
         heard = (observation["message_mask"] > 0) & sent.isfinite().all(-1).unsqueeze(1)
         mean = torch.where(sent.isfinite(), sent, 0.0)[..., :size]
-        unknown = self._unknown(mean)
+        middle, unknown = uniform(self.believed.arena, self.count, mean)
         spread = sent[..., size:].unflatten(-1, (size, size))
         spread = torch.where(spread.isfinite(), spread, unknown.diag())
         precision = torch.linalg.inv(spread)
-        start = 0.5 * (mean.new_tensor(self.believed.arena.low) + mean.new_tensor(self._high))
-        first = start.repeat(self.count) / unknown
-        vector = (precision @ mean.unsqueeze(-1))[..., 0] - first
+        vector = (precision @ mean.unsqueeze(-1))[..., 0] - middle / unknown
         precision = precision - (1 / unknown).diag()
         weight = heard.double()
         added = torch.einsum("bij,bjkl->bikl", weight, precision)

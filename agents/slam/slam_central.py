@@ -1,7 +1,6 @@
 """One filter over a whole team and its map: the reference for UAVs that exchange maps."""
 
-from typing import Literal
-
+from agents.robust import SoftName
 from agents.slam.slam import Slam
 from coloc_env.options import PositiveCount
 from coloc_env.scenario import Believed
@@ -22,6 +21,6 @@ class CentralSlam(Slam):
         believed: Believed,
         *,
         iterations: PositiveCount = 3,
-        robust: Literal["none", "huber"] = "none",
+        robust: SoftName = "none",
     ) -> None:
         super().__init__(believed, iterations=iterations, robust=robust)

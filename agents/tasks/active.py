@@ -122,7 +122,7 @@ class Active(Task):
         unit = _unit(place.unsqueeze(-2) - position[:, None, None])  # [B, i, C, j, 3]
         spread = torch.einsum("bicjd,bjde,bicje->bicj", unit, p, unit)
         weight = (sensor.noise.std**2 + spread).reciprocal()
-        others = ~torch.eye(position.shape[1], dtype=torch.bool)
+        others = ~torch.eye(position.shape[1], dtype=torch.bool, device=place.device)
         weight = weight * others.unsqueeze(1)
         return (unit * weight.unsqueeze(-1)).mT @ unit
 

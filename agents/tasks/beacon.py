@@ -129,19 +129,19 @@ class Beacon(Task):
         p = memory.position
         own = own_covariance(memory.joint)
         near = (p.unsqueeze(2) - p.unsqueeze(1)).norm(dim=-1) <= self.radius
-        near = near & ~torch.eye(p.shape[1], dtype=torch.bool)
+        near = near & ~torch.eye(p.shape[1], dtype=torch.bool, device=p.device)
         gains = intersection_gains(p, own) * near
         memory.more["gains"], memory.more["gain"] = gains, gains.sum(1)
         return memory
 
     def allowed(self, memory: TaskMemory) -> Bool[Tensor, "B n C"]:
-        return torch.ones(*memory.position.shape[:2], 2, dtype=torch.bool)
+        return memory.position.new_ones(*memory.position.shape[:2], 2, dtype=torch.bool)
 
     def extras(self, memory: TaskMemory) -> dict[str, Float32[Tensor, "B n F"]]:
         """Where agents know what they heard, there are no ranks."""
         n, gain = self.n_agents, memory.more["gain"]
         heard = memory.seen[:, :, :n].any(-1).to(gain.dtype)
-        turn = ((memory.step - torch.arange(n)) % n == 0).to(gain.dtype)
+        turn = ((memory.step - torch.arange(n, device=gain.device)) % n == 0).to(gain.dtype)
         flags = (2 * memory.more["called"] - 1, 2 * heard - 1, 2 * turn - 1)
         found = {"gain": log_gain(gain).unsqueeze(-1)}
         if not self.messages:

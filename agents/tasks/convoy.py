@@ -112,7 +112,9 @@ class Convoy(Task):
         x, others = memory.position[..., 0], self.others(memory)
         theirs = others.position[..., 0]  # [B, n, N]
         if others.age is not None:  # of who was never heard: as far as oneself
-            unknown = others.age.isinf() | torch.eye(self.n_agents, dtype=torch.bool)
+            unknown = others.age.isinf() | torch.eye(
+                self.n_agents, dtype=torch.bool, device=x.device
+            )
             theirs = torch.where(unknown, x.unsqueeze(-1), theirs)
         ahead = (x - theirs.mean(-1)) / _RADIUS
         rank = (x.unsqueeze(-1) > theirs).to(x.dtype).mean(-1)

@@ -32,7 +32,7 @@ def range_gains(
     to_j = torch.einsum("bkjde,bije->bijkd", joint, unit)
     columns = to_i - to_j
     n = position.shape[1]
-    i = torch.arange(n)
+    i = torch.arange(n, device=position.device)
     at_i = columns[:, i[:, None], i, i[:, None]]
     at_j = columns[:, i[:, None], i, i]
     s = (unit * (at_i - at_j)).sum(-1) + variance
@@ -48,7 +48,7 @@ def anchor_gains(
     unit, _, variance = directions(position, anchors.expand(len(position), -1, -1))
     columns = torch.einsum("bkide,biae->biakd", joint, unit)
     n = position.shape[1]
-    i = torch.arange(n)
+    i = torch.arange(n, device=position.device)
     own = columns[:, i, :, i].movedim(0, 1)  # [B, i, a, d]
     s = (unit * own).sum(-1) + variance
     return (columns * columns).sum(-1) / s.unsqueeze(-1)

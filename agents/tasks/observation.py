@@ -154,5 +154,5 @@ def log_sigmas(p: Float[Tensor, "*s d d"]) -> Float[Tensor, "*s d"]:
 
 
 def _scaled(log_sigma: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
-    low, high = (torch.tensor(x).log() for x in _SIGMAS)
+    low, high = (torch.tensor(x, device=log_sigma.device).log() for x in _SIGMAS)
     return 2 * (log_sigma - low) / (high - low) - 1

@@ -101,7 +101,7 @@ def _information(place: Float32[Tensor, "B N d"], task: Task) -> Tensor:
     to = to.double()
     heard = (_reached(far, task.radius) / spread).double()
     own = own + (heard[..., None, None] * to.unsqueeze(-1) * to.unsqueeze(-2)).sum(2)
-    i = torch.arange(n)
+    i = torch.arange(n, device=blocks.device)
     blocks[:, i, i] = own
     return blocks.transpose(2, 3).reshape(b, d * n, d * n)
 

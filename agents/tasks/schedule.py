@@ -156,9 +156,9 @@ class Schedule(Task):
 
     def targets_of(self, n: int) -> Int64[Tensor, "n C"]:
         """Whom each UAV calls by each choice but the first: a UAV, or N + m for anchor m."""
-        i = torch.arange(n).unsqueeze(-1)
-        uavs = (i + torch.arange(1, n)) % n
-        return torch.cat((uavs, n + torch.arange(len(self.anchors)).expand(n, -1)), -1)
+        every = torch.arange(n + len(self.anchors), device=self.anchors.device)
+        uavs = (every[:n, None] + every[1:n]) % n
+        return torch.cat((uavs, every[n:].expand(n, -1)), -1)
 
     def commands(self, memory: TaskMemory, action: Float32[Tensor, "B n"]) -> Commands:
         choice = action.long()
@@ -203,11 +203,11 @@ class Schedule(Task):
     def extras(self, memory: TaskMemory) -> dict[str, Float32[Tensor, "B n F"]]:
         """Where agents know what they heard, there are no ranks, and calls are of those heard."""
         n, gain = self.n_agents, memory.more["gain"]
-        i = torch.arange(n)
+        i = torch.arange(n, device=gain.device)
         success = memory.seen.any(-1)
         turn = (memory.step - i) % n == 0
         flags = 2 * torch.stack((success, turn), -1).to(gain.dtype) - 1
-        others = (i[:, None] + torch.arange(n)) % n
+        others = (i[:, None] + i) % n
         called = (memory.more["called"] > 0)[:, others]
         found = {"gain": log_gain(gain)}
         if self.messages:

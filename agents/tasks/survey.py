@@ -158,14 +158,15 @@ class Survey(Task):
         own = memory.position[:, :n, :2]
         edged = torch.nn.functional.pad(known, (2, 2, 2, 2), value=1.0).flatten(2)
         cell = cell_of(own)
-        step = torch.arange(5)
+        step = torch.arange(5, device=own.device)
         about = (cell // _CELLS)[..., None, None] + step[:, None]
         index = about * (_CELLS + 4) + (cell % _CELLS)[..., None, None] + step
         local = edged.gather(2, index.flatten(2))
-        apart = _PLACES - own.unsqueeze(2)
+        places = _PLACES.to(own.device)
+        apart = places - own.unsqueeze(2)
         cost = (apart * apart).sum(-1) + 1e6 * known.flatten(2)
         choice = cost.argmin(-1)
-        way = _PLACES[choice] - own
+        way = places[choice] - own
         length = way.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         coarse = known.unflatten(2, (5, 2)).unflatten(4, (5, 2)).mean((3, 5)).flatten(2)
         return {

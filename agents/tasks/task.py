@@ -116,7 +116,7 @@ class Task(ActionMode):
     def widths(self) -> dict[str, int]:
         """How many numbers each part of an observation has, in order."""
         if self._widths is None:
-            observation = World(self.scenario).reset(0)
+            observation = World(self.scenario, device=self.low.device).reset(0)
             memory = self._estimated(self.reset(observation), observation)
             self._widths = {name: x.shape[-1] for name, x in self.parts(memory).items()}
         return self._widths
@@ -173,7 +173,7 @@ class Task(ActionMode):
             velocity=prior.new_zeros(b, n, d),
             joint=prior.new_zeros(b, n, n, d, d),
             seen=prior.new_zeros(b, n, n + len(self.anchors), dtype=torch.bool),
-            step=torch.full((b, n), -1, dtype=torch.int64),
+            step=prior.new_full((b, n), -1, dtype=torch.int64),
             more=TensorDict(more, batch_size=[b, n]),
             batch_size=[b, n],
         )
@@ -301,7 +301,7 @@ class Task(ActionMode):
         return whole.nan_to_num(0.0).clamp(-1.0, 1.0)
 
     def state_bounds(self, scenario: Scenario) -> tuple[list[float], list[float]]:
-        world = World(self.scenario)
+        world = World(self.scenario, device=self.low.device)
         observation = world.reset(0)
         memory = self._estimated(self.reset(observation), observation)
         size = self.state(memory, world).shape[-1]

@@ -64,21 +64,10 @@ class LinkBiases:
         """Covariance of the biases before anything is measured, and whenever nothing is."""
         return self._each(lambda std, time: std**2).diag()
 
-    def predict(
-        self,
-        covariance: Float64[Tensor, "T k k"],
-        errors: Float64[Tensor, "T m m"],
-        f: Float64[Tensor, "T n E E"],
-    ) -> Float64[Tensor, "T k k"]:
-        """Covariance of errors and biases after a step in which that of the errors became so."""
-        if not self.count:
-            return errors
-        m = errors.shape[-1]
-        phi = self._each(lambda std, time: math.exp(-self.dt / time))
-        cross = (f @ covariance[:, :m, m:].unflatten(1, f.shape[1:3])).flatten(1, 2) * phi
-        own = covariance[:, m:, m:] * phi * phi.unsqueeze(-1)
-        own = own + self.prior * (1 - phi**2)
-        return torch.cat((torch.cat((errors, cross), -1), torch.cat((cross.mT, own), -1)), -2)
+    @property
+    def kept(self) -> Float64[Tensor, "b"]:
+        """The share of each bias that a step leaves, e^(−dt/τ)."""
+        return self._each(lambda std, time: math.exp(-self.dt / time))
 
     def information(
         self,
@@ -129,6 +118,24 @@ class LinkBiases:
         pairs = zip(self.sensors, self.counts, strict=True)
         values = [[number(*_settings(sensor))] * count for sensor, count in pairs]
         return torch.tensor([x for one in values for x in one], dtype=torch.float64)
+
+
+def predicted(
+    covariance: Float64[Tensor, "T k k"],
+    errors: Float64[Tensor, "T m m"],
+    f: Float64[Tensor, "T n E E"],
+    kept: Float64[Tensor, "b"],
+    prior: Float64[Tensor, "b b"],
+) -> Float64[Tensor, "T k k"]:
+    """Covariance of errors and of what is beside them after a step in which that of the errors
+    became so: biases of which the share φ is ``kept`` and that keep their ``prior`` variance."""
+    if not len(kept):
+        return errors
+    m = errors.shape[-1]
+    cross = (f @ covariance[:, :m, m:].unflatten(1, f.shape[1:3])).flatten(1, 2) * kept
+    own = covariance[:, m:, m:] * kept * kept.unsqueeze(-1)
+    own = own + prior * (1 - kept**2)
+    return torch.cat((torch.cat((errors, cross), -1), torch.cat((cross.mT, own), -1)), -2)
 
 
 def updated(

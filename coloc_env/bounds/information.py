@@ -85,12 +85,19 @@ def _landmarks(
     one that re-associates, knows more, so the bound holds for all of them. (That of estimators that
     only discard false matches has (1 − ε) times the information.)
     """
+    return gram(*landmark_rows(sensor, truth, seen))
+
+
+def landmark_rows(
+    sensor: Landmarks, truth: Kinematics, seen: Observation
+) -> tuple[Float64[Tensor, "B N L d D"], Float64[Tensor, "B N L"]]:
+    """Derivatives of each landmark's vector by the pose, and the information of its components."""
     visible = _mask(seen, "landmark_mask")
     others = sensor.false_matches / max(sensor.count - 1, 1)
     correct = 1 - others * (sensor.count - 1)
     expected = (correct - others) * visible + others * visible.sum(-1, keepdim=True)
     _, jacobian = _relative(truth, _points(seen, "landmark_map", truth))
-    return gram(jacobian, expected / max(sensor.std, EXACT) ** 2)
+    return jacobian, expected / max(sensor.std, EXACT) ** 2
 
 
 @own_information.register

@@ -26,6 +26,8 @@ rule out large errors.
   of a recording leave unknown. With ``ConstantVelocity`` the
   process noise is the model's: scripted motion is smoother, and a filter may do better than that.
 - Biases of ranges and heights are states of their own, Gauss–Markov as they are drawn.
+- Landmarks that nobody knows are states, too (see ``landmarks``); of landmarks without names, those
+  that are seen count as known: the bound holds, and nobody who has to find them out need reach it.
 - The information that visibility itself holds is left out; a delayed measurement counts as if made
   when it arrives; the landmark that a false match shows is known (see ``information``); a uniform
   prior is taken as a Gaussian (see ``process``).
@@ -38,9 +40,10 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from coloc_env import noise
-from coloc_env.bounds.biases import LinkBiases, updated
+from coloc_env.bounds.biases import LinkBiases, predicted, updated
 from coloc_env.bounds.expected import expected_information
 from coloc_env.bounds.information import informs_of_motion
+from coloc_env.bounds.landmarks import LandmarkStates, known_landmarks
 from coloc_env.bounds.process import ErrorModel, error_model, prior_covariance, true_sensors
 from coloc_env.bounds.recursion import predict, update
 from coloc_env.bounds.worlds import seeds_of, worlds
@@ -93,10 +96,11 @@ def posterior_bound(
         raise ValueError("posterior_bound: no bound is known for a team that is kidnapped")
     steps = scenario.horizon if steps is None else steps
     model = error_model(scenario)
-    biases = LinkBiases.of(scenario, cooperative)
-    joint = scenario.arena.n_uavs * model.pose().shape[1] + biases.count
+    biases, landmarks = LinkBiases.of(scenario, cooperative), LandmarkStates.of(scenario)
+    scenario = known_landmarks(scenario)
+    joint = scenario.arena.n_uavs * model.pose().shape[1] + biases.count + landmarks.count
     blocks = [
-        _bound(scenario, model, biases, seeds, steps, cooperative)
+        _bound(scenario, model, biases, landmarks, seeds, steps, cooperative)
         for seeds in seeds_of("posterior_bound", scenario, runs, seed, steps, joint)
     ]
     mse, scored = (torch.cat(parts) for parts in zip(*blocks, strict=True))
@@ -107,6 +111,7 @@ def _bound(
     scenario: Scenario,
     model: ErrorModel,
     biases: LinkBiases,
+    landmarks: LandmarkStates,
     seeds: Int64[Tensor, "B"],
     steps: int,
     cooperative: bool,
@@ -119,25 +124,35 @@ def _bound(
     n = scenario.arena.n_uavs if cooperative else 1
     states = (len(seeds), scenario.arena.n_uavs, pose.shape[1])
     sensors = [s for s in true_sensors(scenario) if cooperative or not s.between_uavs]
+    sensors = [s for s in sensors if s is not landmarks.sensor]
     velocity = model.velocity() if any(map(informs_of_motion, sensors)) else None
-    prior = torch.block_diag(*n * [prior_covariance(model, scenario)], biases.prior)
+    beside = torch.block_diag(biases.prior, landmarks.prior)
+    kept = torch.cat((biases.kept, beside.new_ones(landmarks.count)))
+    prior = torch.block_diag(*n * [prior_covariance(model, scenario)], beside)
     covariance = prior.expand(states[0] * states[1] // n, -1, -1)
-    size = n * states[2]  # of a team's errors; its biases follow
+    size = n * states[2]  # of a team's errors; its biases and landmarks follow
     before: Kinematics | None = None
     mse, scored = [], []
     for step, (truth, seen, counts) in enumerate(worlds(scenario, seeds, steps)):
         if before is not None:
             f, q = model.transition(before, truth, seen)
             moved = predict(covariance[:, :size, :size], _by_team(f, n), _by_team(q, n))
-            covariance = biases.predict(covariance, moved, _by_team(f, n))
+            covariance = predicted(covariance, moved, _by_team(f, n), kept, beside)
         root = torch.linalg.cholesky(covariance)
         keys = noise.fold(noise.row_keys(seeds), step)
         white = noise.normal(keys, "bound", states[1] * states[2]).double()
         drawn = (2**0.5 * root[:, :size, :size] @ white.reshape(len(root), -1, 1)).view(states)
         own, shared = expected_information(sensors, truth, seen, drawn, pose, velocity)
-        if biases.count:
-            about = biases.information(truth, seen, drawn, pose, n)
-            covariance = updated(root, _by_team(own, n), shared, about)
+        if len(beside):
+            parts = []
+            if biases.count:
+                parts.append(biases.information(truth, seen, drawn, pose, n))
+            if landmarks.count:
+                of_map, across, coordinates = landmarks.information(truth, seen, pose, n)
+                own = own + of_map
+                parts.append((across, coordinates))
+            cross, each = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+            covariance = updated(root, _by_team(own, n), shared, (cross, each))
         else:
             covariance = update(root, _by_team(own, n), shared)
         variance = covariance.diagonal(dim1=1, dim2=2)[:, :size].reshape(states)

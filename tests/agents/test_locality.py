@@ -12,6 +12,7 @@ from torch import Tensor
 
 from agents import LOCALIZERS
 from agents.factor_graph.dfgo import SmootherBelief
+from agents.factor_graph.mapped import MappedBelief
 from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 
@@ -156,12 +157,15 @@ def believed(run: Any) -> list[Any]:
     """Beliefs, without windows of what was seen as it was seen."""
     mains = [getattr(belief, "main", belief) for belief in run.beliefs]
     mains = [getattr(belief, "reckoned", belief) for belief in mains]
-    return [
-        belief.replace(window=torch.zeros_like(belief.window))
-        if isinstance(belief, SmootherBelief)
-        else belief
-        for belief in mains
-    ]
+
+    def without(belief: Any) -> Any:
+        if isinstance(belief, MappedBelief):
+            return belief.replace(track=without(belief.track))
+        if isinstance(belief, SmootherBelief):
+            return belief.replace(window=torch.zeros_like(belief.window))
+        return belief
+
+    return [without(belief) for belief in mains]
 
 
 def test_values_behind_a_mask_change_nothing(case: SimpleNamespace, tools: SimpleNamespace) -> None:

@@ -10,10 +10,13 @@ import torch
 from pretended import OnCard, card
 from safetensors.torch import load_file
 
+from agents.tasks import make_task
+from agents.tasks.registry import TASKS
 from coloc_env.json_files import read_json
 from training.evaluation.evaluate import silent
 from training.learning import run, trust
 from training.learning.registry import TRAININGS
+from training.learning.tasks.environment import environment
 
 ROOM = "indoor-v0:n_uavs=2:horizon=20:motion=random"
 LEAST = {"worlds": 1, "epochs": 1, "score_runs": 0}
@@ -23,6 +26,8 @@ SWARM = LEAST | {
     "steps": 5,
 }
 POLICY = LEAST | {"scenario": ROOM, "steps": 5, "passes": 1, "minibatches": 2, "hidden": 8}
+TASK = {"worlds": 2, "epochs": 1, "hidden": 8, "score_worlds": 0}
+TASK_PPO = TASK | {"passes": 1, "minibatches": 2}
 KINDS: dict[str, dict[str, Any]] = {
     "pfnn": LEAST | {"scenario": ROOM, "passes": 1, "minibatch": 100},
     "dlspf": LEAST | {"scenario": ROOM.replace("20", "24"), "passes": 1},
@@ -38,13 +43,54 @@ KINDS: dict[str, dict[str, Any]] = {
     "stdcl_loop": SWARM,
     "mappo": POLICY,
     "ippo": POLICY | {"recurrent": False, "base": "none"},
+    "task-mappo": TASK_PPO | {"task": "relay-v0:horizon=6", "network": "recurrent"},
+    "task-ippo": TASK_PPO
+    | {"task": "track-v0:horizon=6", "network": "attention", "moves": "headings"},
+    "task-qmix": TASK | {"task": "schedule-v0:horizon=6", "updates": 3, "minibatch": 8},
 }
-ON_CPU = ("sb3-ppo", "task-ippo", "task-mappo", "task-qmix", "task-sb3-ppo")
+ON_CPU = ("sb3-ppo", "task-sb3-ppo")
 SAME = 1e-5
 
 
 def test_every_training_is_here() -> None:
     assert {*KINDS, *ON_CPU} == set(TRAININGS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["", ":obs=dict:telemetry=messages", ":reward=sigma"])
+@pytest.mark.parametrize("name", TASKS)
+def test_a_tasks_worlds_are_the_cpus(name: str, options: str) -> None:
+    """Observations, rewards and what a critic sees, of actions that are all 0 (the first choice);
+    with what each call was worth where agents call."""
+    difference = hasattr(make_task(name), "targets_of") and not options
+
+    def seen(device: str) -> list[torch.Tensor]:
+        env = environment(
+            make_task(name + options),
+            2,
+            3,
+            device,
+            hold=1,
+            difference=difference,
+            network="attention",
+        )
+        now, found = env.reset(), []
+        for _ in range(3):
+            now["uav", "action"] = torch.zeros_like(env.full_action_spec["uav", "action"].zero())
+            after = env.step(now)["next"]
+            found += [value for _, value in sorted(after.items(True, True), key=str_of)]
+            now = after.exclude(("uav", "reward"))
+        return found
+
+    here = seen("cpu")
+    with card():
+        for one, other in zip(seen("cuda"), here, strict=True):
+            assert isinstance(one, OnCard)
+            torch.testing.assert_close(one.inner, other, rtol=SAME, atol=SAME)
+
+
+def str_of(item: tuple[Any, torch.Tensor]) -> str:
+    return str(item[0])
 
 
 @pytest.mark.slow

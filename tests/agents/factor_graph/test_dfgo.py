@@ -116,13 +116,14 @@ def test_ties_are_those_of_both_graphs_at_once() -> None:
     j, g = normal(1, 1, W, 1, 1, E, seed=7), normal(1, 1, W, 1, 1, d, seed=8)
     r, variance = normal(1, 1, W, 1, 1, seed=9), torch.full((1, 1, W, 1, 1), 0.3).double()
     mask = torch.tensor([True, True, False, True, True]).view(1, 1, W, 1)
-    tracks = Tracks(torch.zeros(1, 1, 1, W, d), other[..., :d, :d].unsqueeze(2), mask.mT)
+    none = torch.zeros(1, 1, 1, W, d, 0).double()
+    tracks = Tracks(none.sum(-1), other[..., :d, :d].unsqueeze(2), mask.mT, none)
 
     def linearize(delta: Tensor) -> list[Block]:
         moved = (j @ delta[:, :, :, None, :, None])[..., 0]
         return [Block(r - moved, j, variance, mask, g, torch.zeros_like(variance))]
 
-    found = tie(sigma, tracks, linearize, robust=False)
+    found = tie(sigma, tracks, linearize, robust="none")
     flat = [x[0, 0].transpose(1, 2).reshape(W * k, W * k).numpy()
             for x, k in ((sigma, E), (other[..., :d, :d], d))]  # fmt: skip
     information = np.zeros((W * (E + d), W * (E + d)))

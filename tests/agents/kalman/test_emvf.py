@@ -22,6 +22,7 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import ConstantVelocity
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import AnchorRanging, Imu, RangeNoise
+from tests.sampling import first_fast
 
 DT = 0.5
 KNOWN = 1e-10  # information that stands for none
@@ -204,7 +205,7 @@ def chi_square_band(dim: int, count: int) -> float:
     return 5 * (2 * dim / count) ** 0.5
 
 
-@pytest.mark.parametrize("memory", [2, 3, 5])
+@pytest.mark.parametrize("memory", first_fast(3, 2, 5))
 def test_errors_are_as_large_as_it_says(memory: int, tools: SimpleNamespace) -> None:
     """Windows overlap: only every M-th estimate counts as another sample."""
     runs, steps = 60, 96

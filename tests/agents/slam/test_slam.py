@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 from agents import make
 from agents.slam.slam import MapBelief, Slam
+from agents.slam.start import uniform
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
@@ -99,7 +100,7 @@ def least(localizer: Slam, prior: MapBelief, seen: Observation, group: list[int]
     start = prior.state[0, group]
     roots = [np.linalg.cholesky(process.initial(seen["prior"].double())[1][0, i]) for i in group]
     middle, size = prior.landmarks[0, 0].numpy().ravel(), 15
-    deviation = np.sqrt(localizer._unknown(start).numpy())
+    deviation = np.sqrt(uniform(localizer.believed.arena, 5, start)[1].numpy())
     z, mask = (leaf[0, group] for leaf in localizer.vectors.read(seen, 3))
 
     def residuals(delta: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ def episode(agent: str, seeds: Tensor, steps: int = 8, **overrides: Any) -> list
 @pytest.fixture(scope="module")
 def results() -> Any:
     agents = ["dwmds_st", "dwmds_st:confidence=huber", "gn", "map", "mds", "dead_reckoning"]
-    return evaluate(make_scenario("swarm-v0", **SMALL | {"n_uavs": 100}), agents, 2)
+    return evaluate(make_scenario("swarm-v0", **SMALL | {"n_uavs": 70}), agents, 2)
 
 
 def error(results: Any, agent: str) -> float:

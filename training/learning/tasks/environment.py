@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
+from agents.parts import move
 from agents.policies.decisions import relations, relations_width
 from agents.tasks.memory import TaskMemory
 from agents.tasks.task import Task
@@ -88,17 +89,26 @@ class Decisions(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         b, n = observation_spec["uav", "observation"].shape[:2]
-        observation_spec["score"] = Unbounded((b, 1))
+        where = self.parent.device
+        observation_spec["score"] = Unbounded((b, 1), device=where)
         width = relations_width(self.task, self.network)
         if width:
             each = n if self.network == "attention" else self.task.choices
-            observation_spec["uav", "relations"] = Unbounded((b, n, each, width))
+            observation_spec["uav", "relations"] = Unbounded((b, n, each, width), device=where)
         return observation_spec
 
 
 def environment(
-    task: Task, worlds: int, seed: int, *, hold: int, difference: bool, network: str
+    task: Task,
+    worlds: int,
+    seed: int,
+    device: str,
+    *,
+    hold: int,
+    difference: bool,
+    network: str,
 ) -> TransformedEnv:
     """``worlds`` worlds of a task from a seed on, for a learner."""
-    env: Any = CoLocEnv(task.scenario, worlds, seed=seed, action=task)
+    move(task, device)
+    env: Any = CoLocEnv(task.scenario, worlds, device, seed=seed, action=task)
     return TransformedEnv(env, Decisions(task, hold, difference, network))

@@ -93,10 +93,10 @@ def policy_of(actor: TaskActor, task: Task) -> tuple[Reader, ProbabilisticActor]
     )
 
 
-def acting(policy: nn.Module, actor: TaskActor, task: Task) -> Any:
+def acting(policy: nn.Module, actor: TaskActor, task: Task, device: str) -> Any:
     """The policy with its decisions as the task's actions."""
     moves = actor.architecture["moves"]
-    menu = None if moves == "none" else table(moves, task.dim)
+    menu = None if moves == "none" else table(moves, task.dim).to(device)
     act = TensorDictModule(
         lambda decision: decision if menu is None else menu[decision],
         [_DECIDED],
@@ -142,6 +142,7 @@ class Critic(nn.Module):
 def _ppo(
     name: str,
     loss_class: type[MAPPOLoss],
+    device: str = "cpu",
     *,
     task: str = "survey-v0:reward=sigma",
     network: Network = "feedforward",
@@ -173,16 +174,18 @@ def _ppo(
         hold=hold,
         hidden=hidden,
         sampled=draw or made.sampled,
-    )
+    ).to(device)
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
-        return environment(made, count, first, hold=hold, difference=difference, network=network)
+        return environment(
+            made, count, first, device, hold=hold, difference=difference, network=network
+        )
 
     central = loss_class is MAPPOLoss
     state = worlds_of(0, 1).observation_spec["state"].shape[-1] if central else 0
     with drawn_from(seed + 1):
-        critic = Critic(made.leaves["observation"].width, hidden, state)
+        critic = Critic(made.leaves["observation"].width, hidden, state).to(device)
     reader, policy = policy_of(actor, made)
     reads: list[Any] = [(_UAV, "observation"), *(["state"] if central else [])]
     value = TensorDictModule(critic, reads, [(_UAV, "state_value")])
@@ -205,7 +208,7 @@ def _ppo(
     loss.make_value_estimator(gamma=gamma, lmbda=gae_lambda)
     optimizer = torch.optim.Adam(loss.parameters(), learning_rate, eps=1e-5)
     decisions = made.scenario.horizon // hold
-    player = acting(policy, actor, made)
+    player = acting(policy, actor, made, device)
 
     def collect(epoch: int) -> Collector:
         # TorchRL draws actions from torch's shared generator: what an epoch draws must depend on
@@ -230,7 +233,7 @@ def _ppo(
     whole = network == "recurrent"  # episodes are kept whole, in order
     rows = worlds if whole else worlds * decisions
     buffer = ReplayBuffer(
-        storage=LazyTensorStorage(rows),
+        storage=LazyTensorStorage(rows, device=device),
         sampler=SamplerWithoutReplacement(),
         batch_size=-(-rows // minibatches),
     )
@@ -261,7 +264,7 @@ def _ppo(
 
 
 @wraps(_ppo, assigned=())
-def task_mappo(**options: Any) -> Training:
+def task_mappo(device: str = "cpu", **options: Any) -> Training:
     """A policy for all UAVs of a task, with a critic that sees the team's observations and truth
     (MAPPO, Yu et al. 2022).
 
@@ -275,17 +278,17 @@ def task_mappo(**options: Any) -> Training:
     rate and entropy bonus fall linearly. At the end the policy meets ``score_worlds`` of the
     protocol's worlds.
     """
-    return _ppo("task-mappo", MAPPOLoss, **options)
+    return _ppo("task-mappo", MAPPOLoss, device, **options)
 
 
 @wraps(_ppo, assigned=())
-def task_ippo(**options: Any) -> Training:
+def task_ippo(device: str = "cpu", **options: Any) -> Training:
     """A policy for all UAVs of a task, with a critic of its own observation (IPPO, de Witt et al.
     2020).
 
     Options as ``coloc train task-mappo`` has them.
     """
-    return _ppo("task-ippo", IPPOLoss, **options)
+    return _ppo("task-ippo", IPPOLoss, device, **options)
 
 
 def figures(batch: TensorDictBase) -> dict[str, float]:

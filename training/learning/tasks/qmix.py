@@ -51,6 +51,7 @@ class Kept:
 
 
 def task_qmix(
+    device: str = "cpu",
     *,
     task: str = "schedule-v0",
     network: Network = "feedforward",
@@ -81,6 +82,7 @@ def task_qmix(
     """
     made = make_task(task)
     actor = actor_for(task, made, seed, network=network, moves=moves, hold=hold, hidden=hidden)
+    actor = actor.to(device)
     if not actor.discrete:
         raise ValueError(f"task-qmix: {made.name} has no choices; moves=headings makes some")
     if network == "recurrent":
@@ -88,11 +90,13 @@ def task_qmix(
 
     def worlds_of(epoch: int, count: int = worlds) -> Any:
         first = world_seed(seed, epoch, worlds)
-        return environment(made, count, first, hold=hold, difference=difference, network=network)
+        return environment(
+            made, count, first, device, hold=hold, difference=difference, network=network
+        )
 
     state = worlds_of(0, 1).observation_spec["state"].shape[-1:]
     with drawn_from(seed + 1):
-        mixer = QMixer(state, 32, made.n_agents, "cpu")
+        mixer = QMixer(state, 32, made.n_agents, device)
     reader = Reader(actor, made.choices is not None)
     values = TensorDictSequential(
         TensorDictModule(reader, reader.keys, [_VALUES]),
@@ -114,12 +118,13 @@ def task_qmix(
         eps_init=1.0,
         eps_end=0.0,
         action_key=_DECIDED,
+        device=device,
         action_mask_key=(_UAV, "action_mask") if reader.masked else None,
     )
-    player = acting(TensorDictSequential(values, explore), actor, made)
+    player = acting(TensorDictSequential(values, explore), actor, made, device)
     decisions = made.scenario.horizon // hold
     generator = torch.Generator()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=minibatch)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(capacity, device=device), batch_size=minibatch)
     buffer.set_rng(generator)
 
     def collect(epoch: int) -> Collector:

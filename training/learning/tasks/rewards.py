@@ -39,7 +39,8 @@ class Difference:
         n = self.task.n_agents
         calls = self.task.commands(memory, memory.more["called"]).calls  # [B, n]
         assert calls is not None
-        silenced = torch.where(torch.eye(n, dtype=torch.bool), SILENT, calls.unsqueeze(1))
+        alone = torch.eye(n, dtype=torch.bool, device=calls.device)
+        silenced = torch.where(alone, SILENT, calls.unsqueeze(1))
         each = torch.cat((calls.unsqueeze(1), silenced), 1)  # [B, 1 + n, n]
         value = self.sigmas(each, self.before, world.now.target)
         self.before = memory.joint
@@ -55,18 +56,19 @@ class Difference:
         before the step and positions after it."""
         b, s, n = calls.shape
         places = torch.cat((place, self.task.anchors.expand(b, -1, -1)), 1)
-        rows = torch.arange(b).repeat_interleave(s)
+        rows = torch.arange(b, device=place.device).repeat_interleave(s)
         flat = calls.flatten(0, 1)
         called = flat.clamp_min(0)
         succeeds = _exchanged(flat, places[rows], n, self.task.radius)
         d, m = self.task.dim, len(self.task.anchors)
-        p = joint.transpose(2, 3).reshape(b, n * d, n * d) + self.added * torch.eye(n * d)
+        added = self.added * torch.eye(n * d, device=place.device)
+        p = joint.transpose(2, 3).reshape(b, n * d, n * d) + added
         p = torch.nn.functional.pad(p, (0, m * d, 0, m * d))[rows]  # anchors: no variance
         unit, _, variance = directions(places, places)
-        every = torch.arange(len(rows))
+        every = torch.arange(len(rows), device=place.device)
         for i in range(n):
             u, r = unit[rows, i, called[:, i]], variance[rows, i, called[:, i]]
-            h = torch.zeros(len(rows), n + m, d)
+            h = place.new_zeros(len(rows), n + m, d)
             h[:, i] = u
             h[every, called[:, i]] -= u
             h = h.flatten(1) * succeeds[:, i, None]
