@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -73,7 +74,7 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     """
     name, *pieces = name.split(":")
     factory = LOCALIZERS.require(name)
-    known = options.of(factory)
+    known = LOCALIZERS.options_of(name)
     texts: list[str] = []
     for piece in pieces:
         key, given, _ = piece.partition("=")
@@ -85,11 +86,15 @@ def make(name: str, scenario: Scenario | Believed, **chosen: Any) -> Localizer:
     believed: Believed = getattr(scenario, "believed", scenario)  # type: ignore[arg-type]
     _require_served(name, factory, believed)
     build = getattr(factory, "for_team", factory)
+    keywords = options.grouped(factory, chosen)
+    _require_localizer(name, build, believed, keywords)
     try:
-        made: Localizer = build(believed, **options.grouped(factory, chosen))
+        made: Localizer = build(believed, **keywords)
     except ValueError as error:
         text, kind = str(error), NotServed if isinstance(error, NotServed) else ValueError
         raise kind(text if text.startswith(name) else f"{name}: {text}") from error
+    if not (hasattr(made, "reset") and hasattr(made, "step")):
+        raise ValueError(f"{name}: a Localizer is needed, not {type(made).__name__}")
     return made
 
 
@@ -101,6 +106,20 @@ def make_inner(name: str, scenario: Scenario | Believed) -> Localizer:
 
 def _is_path(*texts: str) -> bool:
     return any("/" in text or ".safetensors" in text for text in texts)
+
+
+def _require_localizer(
+    name: str, build: Factory, believed: Believed, keywords: dict[str, Any]
+) -> None:
+    """Raise ValueError for what cannot be called as a localizer's class is."""
+    try:
+        inspect.signature(build).bind(believed, **keywords)
+    except TypeError as error:
+        what = "a Localizer is made of a team's beliefs and its own options"
+        raise ValueError(f"{name}: {what}: {error}") from error
+    missing = ", ".join(sorted(getattr(build, "__abstractmethods__", ())))
+    if missing:
+        raise ValueError(f"{name}: {build.__name__} lacks what a Localizer has: {missing}")
 
 
 def _require_served(name: str, factory: Factory, believed: Believed) -> None:
@@ -120,7 +139,7 @@ def _require_served(name: str, factory: Factory, believed: Believed) -> None:
         for sensor in ignored:
             _warn_of_unmodelled(sensor)
     else:
-        others = [one for one in LOCALIZERS if not _ignored(LOCALIZERS[one], believed)]
+        others = [one for one in LOCALIZERS if _fits(one, believed)]
         raise NotServed(
             f"{name}: what the team measures with {', '.join(ignored)} would be ignored; "
             f"these use it: {', '.join(others) or 'none'}"
@@ -135,6 +154,14 @@ def _warn_of_unmodelled(sensor: str) -> None:
         "(agents.models.measurements.measures registers one)",
         stacklevel=4,
     )
+
+
+def _fits(name: str, believed: Believed) -> bool:
+    """Whether a localizer is there and uses all that the team measures."""
+    try:
+        return not _ignored(LOCALIZERS[name], believed)
+    except ValueError:  # of a package that is broken
+        return False
 
 
 def _ignored(factory: Factory, believed: Believed) -> list[str]:

@@ -51,7 +51,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _register() -> None:
-    for scenario in SCENARIOS:
+    for scenario in SCENARIOS.names():  # what two packages bring is said when it is asked for
         for face, maker in (("parallel", "parallel_env"), ("aec", "env")):
             pettingzoo.register(
                 face,

@@ -9,8 +9,9 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import tokenize
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, reduce
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -43,7 +44,8 @@ class Registry(Mapping[str, Factory]):
         """
         found = dict(self._built_in)
         for point in _points(self.group):
-            if found.setdefault(point.name, point.value) != point.value:
+            value = f"{point.module}:{point.attr}"
+            if found.setdefault(point.name, value) != value:
                 package = point.dist.name if point.dist else point.module
                 raise ValueError(
                     f"{package} brings the {self.kind} {point.name!r}, which exists already "
@@ -53,15 +55,19 @@ class Registry(Mapping[str, Factory]):
 
     def __getitem__(self, name: str) -> Factory:
         """The factory of a name, imported now if it was not. Raises KeyError for an unknown name,
-        ValueError where the package that brings it cannot be imported."""
+        ValueError where the package that brings it cannot be imported, whatever it raises then."""
         if name in self._registered:
             return self._registered[name]
         if name not in self._loaded:
             module, _, attribute = self._references[name].partition(":")
+            where = f"{self.kind} {name!r} ({module}:{attribute})"
             try:
-                factory: Factory = getattr(importlib.import_module(module), attribute)
-            except (ImportError, AttributeError) as error:
-                raise ValueError(f"{self.kind} {name!r} ({module}:{attribute}): {error}") from error
+                home: Any = importlib.import_module(module)
+                factory: Factory = reduce(getattr, attribute.split("."), home)
+            except (Exception, SystemExit) as error:
+                raise ValueError(f"{where}: {_words(error)}") from error
+            if not callable(factory):
+                raise ValueError(f"{where}: a function or class is needed, not {factory!r}")
             self._loaded[name] = factory
         return self._loaded[name]
 
@@ -73,6 +79,11 @@ class Registry(Mapping[str, Factory]):
 
     def __contains__(self, name: object) -> bool:
         return name in self._registered or name in self._references
+
+    def names(self) -> list[str]:
+        """All names; one that two packages have taken counts once, and is no error here."""
+        taken = (point.name for point in _points(self.group))
+        return sorted({*self._built_in, *taken, *self._registered})
 
     def register(self, name: str) -> Callable[[_F], _F]:
         """A decorator that adds a factory under a name while the program runs; one that was added
@@ -97,16 +108,32 @@ class Registry(Mapping[str, Factory]):
         return self[name]
 
     def options_of(self, name: str) -> dict[str, Option]:
-        """Options of a name's factory. Raises ValueError for an unknown name."""
-        return options.of(self.require(name))
+        """Options of a name's factory. Raises ValueError for an unknown name, and where a package
+        annotates them with what cannot be read."""
+        factory = self.require(name)
+        try:
+            return options.of(factory)
+        except Exception as error:
+            what = f"{self.kind} {name!r}: its options cannot be read"
+            raise ValueError(f"{what}: {_words(error)}") from error
 
     def summary(self, name: str) -> str:
         """First paragraph of the docstring, in one line; read from the source where the module is
-        not imported yet."""
+        not imported yet. Where that cannot be read, what is wrong, in brackets."""
         if name in self._registered or name in self._loaded:
             return options.paragraphs(inspect.getdoc(self[name]) or "")[0]
         module, _, attribute = self._references[name].partition(":")
-        return options.paragraphs(_docstring(module, attribute))[0]
+        try:
+            return options.paragraphs(_docstring(module, attribute))[0]
+        except (OSError, SyntaxError, ValueError) as error:
+            return f"({module}: {_words(error)})"
+
+
+def _words(error: BaseException) -> str:
+    """An error in one line, with its kind where that says more than its text."""
+    text = " ".join(str(error).split())
+    plain = isinstance(error, ImportError | AttributeError)
+    return text if plain and text else f"{type(error).__name__}: {text}"
 
 
 def _points(group: str) -> list[EntryPoint]:
@@ -126,11 +153,14 @@ def _located(module: str) -> ModuleSpec | None:
 
 
 def _docstring(module: str, attribute: str) -> str:
-    """The docstring of a module's function or class, from its source; empty if there is none."""
+    """The docstring of a module's function or class, from its source; empty if there is none.
+    Raises OSError where there is no such module, SyntaxError where it is no Python."""
     spec = _located(module)
-    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+    if spec is None:
+        raise FileNotFoundError("no such module")
+    if spec.origin is None or not spec.origin.endswith(".py"):
         return ""
-    with open(spec.origin, encoding="utf-8") as file:
+    with tokenize.open(spec.origin) as file:
         tree = ast.parse(file.read())
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == attribute:

@@ -63,6 +63,7 @@ def iterated_update(
     process, x, covariance = screen.process, prior.state, prior.covariance
     state, updated, delta = x, covariance, torch.zeros_like(covariance[..., 0])
     evidence, blocks, trusts = None, [], []
+    first: list[Block] = []  # at the prior
     broad = prior.broad(process.dim).unsqueeze(-1)
     extra = screen.extra if bool(broad.any()) else 0
 
@@ -75,7 +76,7 @@ def iterated_update(
     for iteration in range(-extra, iterations):
         blocks = linearize(state, screen.models)
         if iteration == -extra:
-            evidence = screen.judge(blocks, prior)
+            first, evidence = blocks, screen.judge(blocks, prior)
         trusts = screen.weigh(blocks, evidence, iteration == iterations - 1)
         precision, vector = information(blocks, trusts)
         if iteration > -extra:  # residuals are about state = x ⊞ δ: refer them to the prior
@@ -88,9 +89,14 @@ def iterated_update(
     if bool(vague.any()):
         d, theirs = process.dim, torch.diag_embed(neighbours.variance)
         own, shared = by_kind(screen.models)
-        kinds = pick(screen.models, own), pick(screen.models, shared)
+        kinds = own, shared
+
+        def at_vague(at: Tensor, cooperative: bool) -> list[Block]:
+            which = kinds[cooperative]
+            return pick(first, which) if at is x else linearize(at, pick(screen.models, which))
+
         model = Estimation(
-            lambda at, cooperative: linearize(at, kinds[cooperative]),
+            at_vague,
             information,
             process.boxplus,
             lambda p: p[..., None, :d, :d] + theirs,

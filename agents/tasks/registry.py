@@ -41,7 +41,7 @@ def make_task(name: str, **chosen: Any) -> Task:
     """
     name, *texts = name.split(":")
     factory = TASKS.require(name)
-    known = options.of(factory)
+    known = TASKS.options_of(name)
     chosen = options.checked(name, options.parse_all(name, texts, known, chosen), known)
     made: Task = factory(**options.grouped(factory, chosen))
     return made
@@ -49,7 +49,7 @@ def make_task(name: str, **chosen: Any) -> Task:
 
 def register() -> None:
     """Register all tasks with PettingZoo and Gymnasium, as ``coloc/NAME``."""
-    for task in TASKS:
+    for task in TASKS.names():
         name, chosen = f"coloc/{task}", {"task": task}
         if name not in gymnasium.registry:
             home = "agents.tasks.single:SingleAgentTask"

@@ -44,10 +44,14 @@ def make_scenario(name: str, **overrides: Any) -> Scenario:
     family = SCENARIOS.require(name)
     overrides = options.checked(name, overrides, SCENARIOS.options_of(name))
     try:
-        return replace(family(**options.grouped(family, overrides)), overrides=overrides)
+        made: Any = family(**options.grouped(family, overrides))
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(name) else f"{name}: {text}") from error
+    if not hasattr(made, "overrides"):
+        raise ValueError(f"{name}: a Scenario is needed, not {type(made).__name__}")
+    found: Scenario = replace(made, overrides=overrides)
+    return found
 
 
 def scenario_from(scenario: str | Scenario, overrides: dict[str, Any]) -> Scenario:

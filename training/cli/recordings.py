@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -35,6 +35,18 @@ def recordings(
             "better of **ekf** and **ekf:robust=huber** on it.",
         ),
     ] = False,
+    constants: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHICH",
+            help="For each dataset, which constants are best on the *others*, and what they are "
+            "worth on it: those of a **bank** (λ, ν, θ), or of considered **biases** (σ_b, τ).",
+        ),
+    ] = None,
+    span: Annotated[
+        str | None,
+        typer.Option(metavar="FROM:TO", help="With --constants: only this part, in s."),
+    ] = None,
     threads: Threads = 1,
     data: Data = None,
 ) -> None:
@@ -47,12 +59,17 @@ def recordings(
     coloc recordings --data ~/recordings
 
     coloc recordings --agents ekf,ekf:robust=huber,ekf_trust --runs 3 --out recordings.json
+
+    coloc recordings --constants biases --span 0:120 --out biases.json
     """
     require_seed(seed)
     if runs < 1:
         raise ValueError(f"--runs {runs} is not allowed: at least 1")
     if data is not None:
         os.environ["COLOC_DATA"] = str(data)
+    if constants is not None:
+        _constants(constants, only, span, seed, out, threads)
+        return
     if agents is None:
         _list()
         return
@@ -61,7 +78,7 @@ def recordings(
     use_threads(threads)
     from coloc_env.datasets import DATASETS
     from coloc_env.options import require_known
-    from coloc_env.staging import require_writable, staged_file
+    from coloc_env.staging import require_writable
     from training.evaluation import recordings as all_of_them
     from training.evaluation.evaluate import split_agents
 
@@ -82,10 +99,7 @@ def recordings(
             table = all_of_them.table(
                 figures, tuned, names, runs, seed, command, "measured by this command"
             )
-            if out is not None:  # what is measured so far, should the rest be stopped
-                text = json.dumps(table, indent=1, ensure_ascii=False)
-                with staged_file(out) as file:
-                    file.write_text(text + "\n", encoding="utf-8")
+            _write(table, out)  # what is measured so far, should the rest be stopped
     show(table["header"], table["rows"])
     if leave_one_out:
         chosen = all_of_them.chosen_elsewhere(figures, names)
@@ -93,6 +107,46 @@ def recordings(
             ["dataset", "chosen on the others", "× best classical"],
             [[key, agent, f"{ratio:.3f}"] for key, (agent, ratio) in chosen.items()],
         )
+
+
+def _constants(
+    which: str, only: str | None, span: str | None, seed: int, out: Path | None, threads: int
+) -> None:
+    """Measure how far constants carry."""
+    from training.threads import use_threads
+
+    use_threads(threads)
+    from coloc_env.datasets import DATASETS
+    from coloc_env.options import require_known
+    from coloc_env.scenarios import parse_overrides
+    from coloc_env.staging import require_writable
+    from training.evaluation import constants
+
+    if which not in get_args(constants.Which):
+        raise ValueError(f"--constants {which} is not allowed: bank or biases")
+    chosen = cast("constants.Which", which)
+    datasets = None if only is None else only.split(",")
+    require_known("dataset", datasets, DATASETS)
+    require_writable(out)
+    cut = {} if span is None else parse_overrides("replay-hanyang-v0", [f"span={span}"])
+    with progress() as bars:
+        found = constants.measure(chosen, datasets, seed, bars, **cut)
+    command = f"coloc recordings --constants {which}"
+    for name, value in (("only", only), ("span", span), ("seed", seed)):
+        command += "" if value is None else f" --{name} {value}"
+    table = constants.table(chosen, found, command, "measured by this command")
+    _write(table, out)
+    show(table["header"], table["rows"])
+
+
+def _write(table: dict[str, Any], out: Path | None) -> None:
+    """As JSON, where a file is wanted."""
+    from coloc_env.staging import staged_file
+
+    if out is None:
+        return
+    with staged_file(out) as file:
+        file.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _list() -> None:

@@ -20,7 +20,8 @@ from training.evaluation.tables import short
 
 AGENTS = (
     *("ekf", "ekf:robust=huber", "ekf_trust:bank=false", "ekf_trust"),
-    *("ekf:robust=huber:fusion=pairwise", "ekf_joint:robust=huber"),
+    *("ekf:robust=huber:fusion=pairwise", "ekf:robust=huber:fusion=exchange"),
+    "ekf_joint:robust=huber",
     *("map", "stdcl:variant=calibrated:bank=true", "hpff:main=ekf", "nnhpff:main=ekf"),
 )
 CLASSICAL = AGENTS[:2]
@@ -70,9 +71,9 @@ def recorded(data: str | None = None) -> Iterator[Recorded]:
 def measure(
     scenario: Scenario, agents: Sequence[str], runs: int, seed: int, progress: Progress = silent
 ) -> dict[str, dict[str, Any]]:
-    """By agent: RMSE (m), NEES scaled to 3 dimensions, UAVs lost, and the share of time that a
-    bank's learned branch spoke (None without a bank); ``refused``, and why, where an agent does not
-    serve the recording."""
+    """By agent: RMSE (m), NEES scaled to 3 dimensions, UAVs lost, the share of time that a bank's
+    learned branch spoke (None without a bank), and bytes that a UAV sent in a step (None where it
+    sends none); ``refused``, and why, where an agent does not serve the recording."""
     found: dict[str, dict[str, Any]] = {}
     seeds = torch.arange(seed, seed + runs)
     for i, agent in enumerate(agents):
@@ -89,12 +90,14 @@ def measure(
         scored = one.worlds.scored
         beyond = Evaluation(scenario, one.worlds, None, {agent: one}, {}).lost_beyond
         share = one.series.get("trust_share")
+        sent = one.series.get("bytes") if scenario.arena.n_uavs > 1 else None
         found[agent] = {
             "rmse": metrics.rmse(one.error, scored),
             "nees": 3 / scenario.arena.dim * metrics.mean(one.nees[scored]),
             "lost": int(metrics.lost(one.error, scored, scenario.arena.dt, beyond).sum()),
             "uavs": int(scored.any(1).sum()),
             "trust_share": None if share is None else float(np.nanmean(share[scored])),
+            "bytes": None if sent is None else float(np.nanmean(sent)),
         }
         found[agent] = plain(found[agent])
     progress(scenario.name, len(agents), len(agents))
@@ -118,7 +121,8 @@ def table(
     return {
         "title": "Every recording",
         "caption": "RMSE in m (NEES, scaled so that 3 is honest); † UAVs lost of all runs'; % of "
-        "the time that trust speaks; **bold**: at most 1.05 × the better of `ekf` and Huber; ᵗ "
+        "the time that trust speaks; B: bytes that a UAV sends in a step; **bold**: at most 1.05 × "
+        "the better of `ekf` and Huber; ᵗ "
         f"constants were chosen on it. {runs} runs, seeds {seed} to {seed + runs - 1}.",
         "command": command,
         "provenance": provenance,
@@ -141,17 +145,31 @@ def chosen_elsewhere(
             if agent not in CLASSICAL and "rmse" in by_agent[agent] and best < float("inf"):
                 ratio = float(np.log(by_agent[agent]["rmse"] / best))
                 ratios.setdefault(name.split("/")[0], {}).setdefault(agent, []).append(ratio)
+    means = {
+        dataset: {agent: float(np.mean(every)) for agent, every in here.items()}
+        for dataset, here in ratios.items()
+    }
+    return {
+        dataset: (agent, float(np.exp(means[dataset][agent])))
+        for dataset, agent in best_elsewhere(means).items()
+    }
+
+
+def best_elsewhere(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    """By dataset: whose mean score over all *other* datasets is least, of those that have one here.
+
+    Raises:
+        ValueError: there is but one dataset.
+    """
     found = {}
-    for dataset, here in ratios.items():
-        others = [one for other, one in ratios.items() if other != dataset]
+    for dataset, here in scores.items():
+        others = [one for other, one in scores.items() if other != dataset]
         if not others:
             raise ValueError(f"only {dataset} was measured: another dataset is needed to choose on")
-        scores = {
-            agent: float(np.mean([np.mean(one[agent]) for one in others if agent in one]))
-            for agent in here
+        elsewhere = {
+            name: float(np.mean([one[name] for one in others if name in one])) for name in here
         }
-        agent = min(scores, key=lambda name: scores[name])
-        found[dataset] = (agent, float(np.exp(np.mean(here[agent]))))
+        found[dataset] = min(elsewhere, key=lambda name: elsewhere[name])
     return found
 
 
@@ -172,4 +190,6 @@ def _cell(one: Mapping[str, Any], best: float) -> str:
         text += f" †{one['lost']}/{one['uavs']}"
     if one["trust_share"] is not None:
         text += f" {100 * one['trust_share']:.0f} %"
+    if one["bytes"] is not None:
+        text += f" {one['bytes']:.0f} B"
     return text

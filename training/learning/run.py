@@ -239,6 +239,8 @@ def _built(name: str, chosen: Mapping[str, Any], device: str) -> Training:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise
         raise ValueError(f"{name}: these options need more memory than there is") from None
+    if not hasattr(training, "trainer"):
+        raise ValueError(f"{name}: a Training is needed, not {type(training).__name__}")
     return training
 
 

@@ -18,7 +18,7 @@ CLASSICAL = {"ekf": 1.0, "ekf:robust=huber": 0.8}
 
 def figures(**rmse: float) -> dict[str, dict[str, Any]]:
     every = CLASSICAL | rmse
-    rest = {"nees": 3.0, "lost": 0, "uavs": 2, "trust_share": None}
+    rest = {"nees": 3.0, "lost": 0, "uavs": 2, "trust_share": None, "bytes": None}
     return {name: {"rmse": value, **rest} for name, value in every.items()}
 
 
@@ -44,13 +44,13 @@ def test_constants_are_chosen_without_the_dataset_they_are_judged_on() -> None:
 
 def test_cells_say_what_is_good_lost_refused_and_tuned() -> None:
     one = figures(bank=0.84, bad=0.85, none=1.0)
-    one["bank"]["trust_share"] = 0.256
+    one["bank"] |= {"trust_share": 0.256, "bytes": 24.0}
     one["bad"]["lost"] = 1
     one["none"] = {"refused": "why"}
     agents = (*CLASSICAL, "bank", "bad", "none")
     found = table({"x/1": one}, {"x/1": True}, agents, 2, 5, "command", "here")
     assert found["rows"] == [
-        ["x/1 ᵗ", "1 (3)", "**0.8** (3)", "**0.84** (3) 26 %", "0.85 (3) †1/2", "–"]
+        ["x/1 ᵗ", "1 (3)", "**0.8** (3)", "**0.84** (3) 26 % 24 B", "0.85 (3) †1/2", "–"]
     ]
     assert "seeds 5 to 6" in found["caption"]
     assert len(found["header"]) == len(found["align"]) == 6

@@ -364,3 +364,10 @@ def test_more_threads_than_this_machine_has(
         ValueError, match=r"run.json: threads 4000 is not allowed: 1 to \d+ on this"
     ):
         runs.resume(tmp_path / "run", quiet)
+
+
+def test_what_makes_no_training_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TRAININGS._registered, "none", lambda: None)
+    with pytest.raises(ValueError, match="none: a Training is needed, not NoneType"):
+        runs.start("none", {}, tmp_path / "run", lambda *_: None)
+    assert not (tmp_path / "run").exists()

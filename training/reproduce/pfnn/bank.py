@@ -1,5 +1,7 @@
 """How much of what learned trust wins a bank keeps, as the mean log ratio over worlds."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from training.evaluation.metrics import Floats
@@ -30,25 +32,38 @@ def gain_table(results: Results) -> Table | None:
     banks = [a for a in agents if a.startswith(("ekf_trust", "pf_trust")) and a != ALONE]
     if HUBER not in agents or ALONE not in agents or not banks:
         return None
-    rows = []
+    rows, worlds = [], []
     for variant in variants():
         there = results.runs(variant.key, agents)
-        if HUBER not in there or ALONE not in there:
-            continue
-        huber, alone = rmse(there[HUBER]), rmse(there[ALONE])
-        cells = [short(float(np.exp(np.log(x).mean()))) for x in (huber, alone)]
-        for bank in banks:
-            if bank not in there:
-                cells.append(DASH)
-                continue
-            ours = rmse(there[bank])
-            share, low, high, most = kept(huber, alone, ours)
-            text = short(float(np.exp(np.log(ours).mean())))
-            if abs(most) > _NOTHING:
-                text += f" ({share:.2f}; {low:.2f} to {high:.2f})"
-            cells.append(text)
-        rows.append([variant.title, str(len(huber)), *cells])
+        if HUBER in there and ALONE in there:
+            every = {agent: rmse(runs) for agent, runs in there.items()}
+            rows.append([variant.title, *_cells(every, banks)])
+            if variant.scenario == "indoor-v0":
+                worlds.append(every)
+    if len(worlds) > 1:
+        whole = [agent for agent in agents if all(agent in one for one in worlds)]
+        pooled = {agent: np.concatenate([one[agent] for one in worlds]) for agent in whole}
+        rows.append(["all that are simulated", *_cells(pooled, banks)])
     header = ["variant", "worlds", f"`{HUBER}`", f"`{ALONE}`", *(f"`{bank}`" for bank in banks)]
     return Table(
         "Typical RMSE in m, and the log gain over Huber that a bank keeps (90 %)", header, rows
     )
+
+
+def _cells(every: Mapping[str, Floats], banks: Sequence[str]) -> list[str]:
+    """How many worlds, what Huber's weights and trust alone reach in them, and what banks do."""
+    huber, alone = every[HUBER], every[ALONE]
+    cells = [str(len(huber)), *(_typical(one) for one in (huber, alone))]
+    for bank in banks:
+        if bank not in every:
+            cells.append(DASH)
+            continue
+        share, low, high, most = kept(huber, alone, every[bank])
+        interval = f" ({share:.2f}; {low:.2f} to {high:.2f})" if abs(most) > _NOTHING else ""
+        cells.append(_typical(every[bank]) + interval)
+    return cells
+
+
+def _typical(rmses: Floats) -> str:
+    """Geometric mean over worlds."""
+    return short(float(np.exp(np.log(rmses).mean())))
