@@ -26,7 +26,7 @@ SIMULATED: Mapping[str, Mapping[str, Any]] = {  # where learned trust gains most
     "false matches": {"false_matches": 0.1},
     "both with five landmarks": {"nlos": 0.3, "false_matches": 0.1, "landmarks": 5},
 }
-WORLDS, STEPS = 24, 300  # of each of these
+WORLDS, STEPS = 8, 300  # of each of these
 _MRCLAM_STD = 0.2  # m, of the noise of its ranges: its biases are believed in multiples of that
 
 
