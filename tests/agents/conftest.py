@@ -126,6 +126,7 @@ CHOSEN = {
     "pf500": ("default", "anchors", "plane"),
     **dict.fromkeys(("pfnn", "pf_trust"), ("default", "plane")),
     "pf_auxiliary": ("default", "anchors"),
+    "pf_corrected": ("default", "anchors", "plane", "tags"),
     "pf_mixture": ("default", "uniform", "plane"),
     "pf_rao_blackwell": ("default", "imu_bias", "anchors", "plane", "tags"),
     "mappo": ("default", "slots", "plane"),
