@@ -169,8 +169,8 @@ def _worlds(
 ) -> Iterator[tuple[str, Callable[..., Scenario], torch.Tensor]]:
     """Datasets, what makes each world of them (with more overrides), and its seeds."""
     for one in recorded():
-        biased = which == "bank" or one.dataset in bias_constants()[0].overrides
-        if biased and (only is None or one.dataset in only):
+        serves = which == "bank" or one.dataset in bias_constants()[0].overrides
+        if serves and (only is None or one.dataset in only):
             yield one.dataset, partial(one.scenario, **overrides), torch.tensor([seed])
     if which == "bank":
         for variant in SIMULATED.values():
