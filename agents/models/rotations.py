@@ -5,6 +5,7 @@ the states of Kalman filters one product with a constant matrix saves some thirt
 cost is their number; for clouds of particles ``geometry``'s elementwise forms are faster.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -12,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coloc_env import geometry
-from coloc_env.geometry import concat
 
 # States have these dimensions (B, N, k), clouds more. The batch's size must not decide: both forms
 # round differently, and a row's numbers would depend on who else is in the batch.
@@ -48,8 +48,16 @@ def _bilinear(
     matrix: Float[Tensor, "16 k"], a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]
 ) -> Float[Tensor, "*s k"]:
     # One row a state: products with one column go a way of their own and round differently.
-    outer = (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
-    return (outer.reshape(-1, 16) @ matrix).view(*outer.shape[:-1], -1)
+    outer = a.unsqueeze(-1) * b.unsqueeze(-2)
+    return (outer.reshape(-1, 16) @ matrix).view(*outer.shape[:-2], -1)
+
+
+def concat(parts: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n"]:
+    """Vectors side by side in the last dimension; those of clouds in ``geometry``'s memory order,
+    which costs three operations a part more."""
+    if parts[0].dim() > _STATES:
+        return geometry.concat(tuple(parts))
+    return torch.cat(tuple(parts), -1)
 
 
 def product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:

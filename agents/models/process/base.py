@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.models import rotations
-from agents.models.rotations import rotate_by, rotation_between
-from coloc_env.geometry import concat
+from agents.models.rotations import concat, rotate_by, rotation_between
 from coloc_env.observation import Observation
 
 UNIFORM_YAW = math.pi / math.sqrt(3)  # rad, standard deviation of a heading that may be any

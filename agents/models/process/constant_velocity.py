@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.models.process.base import Process
+from agents.models.rotations import concat
 from coloc_env import scenario as believed_processes
-from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 
 

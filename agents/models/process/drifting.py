@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from agents.models.process.base import LEAST_STD, Process
-from coloc_env.geometry import concat
+from agents.models.rotations import concat
 from coloc_env.observation import Observation
 from coloc_env.sensors import Height
 

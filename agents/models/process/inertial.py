@@ -6,9 +6,9 @@ from torch import Tensor
 
 from agents.models import rotations
 from agents.models.process.base import LEAST_STD, Process
-from agents.models.rotations import rotate, rotate_by
+from agents.models.rotations import concat, rotate, rotate_by
 from coloc_env import scenario as believed_processes
-from coloc_env.geometry import concat, cross_matrix
+from coloc_env.geometry import cross_matrix
 from coloc_env.observation import Observation
 from coloc_env.sensors import GRAVITY, Imu
 

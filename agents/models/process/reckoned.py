@@ -6,9 +6,8 @@ from torch import Tensor
 
 from agents.models import rotations
 from agents.models.process.base import Process
-from agents.models.rotations import rotate, rotate_by, rotation_between
+from agents.models.rotations import concat, rotate, rotate_by, rotation_between
 from coloc_env import scenario as believed_processes
-from coloc_env.geometry import concat
 from coloc_env.observation import Observation
 from coloc_env.sensors import Displacement, Ins, Odometry
 

@@ -227,6 +227,7 @@ def test_progress() -> None:
         ({"agents": ["ekff"]}, "did you mean 'ekf'"),
         ({"agents": ["ekf:robust=maybe"]}, "robust='maybe' is not allowed"),
         ({"runs": 0}, "runs=0"),
+        ({"runs": 10**11}, "runs=100000000000 is not allowed: 1 to 10000000"),
         ({"seed": -1}, "seed=-1"),
         ({"chunk": 0}, "chunk=0"),
     ],
