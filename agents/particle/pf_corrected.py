@@ -40,7 +40,7 @@ class CorrectedParticleFilter(AdaptiveParticleFilter):
         self,
         believed: Believed,
         *,
-        weights: str = "none",
+        weights: str = "pf_corrected",
         soft: Share = 1.0,
         **options: Any,
     ) -> None:
