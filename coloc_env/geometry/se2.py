@@ -65,23 +65,25 @@ class Se2(Poses):
         positions are exact to about 1e-15 of the positions' own size squared. Not differentiable
         where two headings are the same."""
         there, w = y[..., :2], weight.unsqueeze(-1)
-        turns = (y[..., None, :, 2] - x[..., :, None, 2]) / (2 * torch.pi)
-        half = torch.pi * (turns - turns.round())
-        along = torch.where(half == 0, 1.0, half / half.tan())  # ½θ cot ½θ
+        turns = y[..., 2] / (2 * torch.pi), x[..., 2] / (2 * torch.pi)
+        half = turns[0].unsqueeze(-2) - turns[1].unsqueeze(-1)
+        half -= half.round()  # in place: memory's first use costs more than the arithmetic
+        half *= torch.pi
+        half += torch.finfo(x.dtype).tiny
+        along = half.tan().reciprocal_().mul_(half)  # ½θ cot ½θ
         columns = torch.cat((w * there, w), -1)
-        (a, b), (c, d) = (_apart(each @ columns, x).unbind(-1) for each in (along, half))
+        here, angles = x[..., :2], half @ columns
+        (a, b), (c, d) = (_apart(sums, here).unbind(-1) for sums in (along @ columns, angles))
         u, v = a + d, b - c  # Σ w V⁻¹ (t_n − t_m)
         cosine, sine = x[..., 2].cos(), x[..., 2].sin()
-        turn = 2 * (half @ w)[..., 0]
-        lengths = w * there.square().sum(-1, keepdim=True)
-        sizes = along.square() + half.square()  # |V⁻¹ p|² / |p|²
-        sums = sizes @ torch.cat((columns, lengths), -1)
-        here = x[..., :2]
+        squared = half * half
+        sizes = torch.addcmul(squared, along, along)  # |V⁻¹ p|² / |p|²
+        sums = sizes @ torch.cat((columns, w * there.square().sum(-1, keepdim=True)), -1)
         position = sums[..., 3] + (here * (sums[..., 2:3] * here - 2 * sums[..., :2])).sum(-1)
         return Pulls(
-            join((cosine * u + sine * v, cosine * v - sine * u, turn)),
+            join((cosine * u + sine * v, cosine * v - sine * u, 2 * angles[..., 2])),
             position.clamp_min(0.0),
-            4 * (half.square() @ w)[..., 0],
+            4 * (squared @ w)[..., 0],
         )
 
     @staticmethod
@@ -112,9 +114,9 @@ class Se2(Poses):
         return _upper((along, -half, last[0], half, along, last[1]))
 
 
-def _apart(sums: Float[Tensor, "*s m 3"], x: Float[Tensor, "*s m 3"]) -> Float[Tensor, "*s m 2"]:
+def _apart(sums: Float[Tensor, "*s m 3"], t: Float[Tensor, "*s m 2"]) -> Float[Tensor, "*s m 2"]:
     """``Σ_n a_mn (t_n − t_m)`` from ``Σ_n a_mn t_n`` and ``Σ_n a_mn``."""
-    return sums[..., :2] - sums[..., 2:] * x[..., :2]
+    return sums[..., :2] - sums[..., 2:] * t
 
 
 def _arc(angle: Float[Tensor, "*s"]) -> tuple[Tensor, Tensor]:
