@@ -48,6 +48,7 @@ def test_teams_find_each_other(name: str, agent: str, steps: int) -> None:
     assert converged(name, agent, 6, steps).sum() >= 5
 
 
+@pytest.mark.slow
 def test_ten_share_the_penalty_and_find_each_other() -> None:
     ten = {"n_uavs": 10, "matches_per_step": 3}
     assert converged("stein2d-v0", "cspf:particles=1", 6, 100, **ten).sum() >= 5
@@ -122,6 +123,7 @@ def test_nan_harms_nobody_else(tools: SimpleNamespace) -> None:
     torch.testing.assert_close(moved.position[:, 1], run.position[:, 1], rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_a_uav_that_was_not_heard_is_caught_up_with() -> None:
     """Links that come and go: holders learn later what others did meanwhile."""
     lossy = {"message_loss": 0.3, "outliers": 0.1}

@@ -117,6 +117,7 @@ def test_every_layer_moves(
     assert (bias[3:] != float(np.log(0.3))).all(), "the log-std is learned, too"
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights(
     options: dict[str, Any], unbroken: dict[str, bytes], tmp_path: Path
 ) -> None:
