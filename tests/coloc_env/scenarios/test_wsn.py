@@ -248,7 +248,7 @@ def test_everyone_is_carried_across_the_room() -> None:
         ({"case": "2"}, "case='2' is not allowed: one of 1, 2, 3"),
         ({"anchors": 0}, "anchors=0 is not allowed: 1 to 8"),
         ({"anchors": 9}, "anchors=9 is not allowed: 1 to 8"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number from 1 to 10000"),
         ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),
         ({"uwb_std": -0.1}, "uwb_std=-0.1 is not allowed: a number ≥ 0 in m is needed"),
         ({"believed_uwb_std": 0.0}, "believed_uwb_std=0.0 is not allowed: a number > 0 in m or"),
