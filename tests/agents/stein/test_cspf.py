@@ -13,6 +13,7 @@ from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
+from tests.sampling import slowly
 from training.evaluation.team import team_figures
 
 STRANGER = 1
@@ -37,11 +38,13 @@ def converged(name: str, agent: str, seeds: int, steps: int, **overrides: Any) -
     ("name", "agent", "steps"),
     [
         ("stein2d-v0", "cspf", 90),
-        ("stein2d-v0", "cspf:particles=1", 90),
-        ("stein3d-v0", "cspf:particles=20", 70),
-        ("stein2d-v0", "pf_joint:anneal=0.96", 130),
         ("stein2d-v0", "pose_graph:every=60", 60),
-        ("stein3d-v0", "pose_graph:robust=gnc:every=40", 40),
+        *slowly(
+            ("stein2d-v0", "cspf:particles=1", 90),
+            ("stein3d-v0", "cspf:particles=20", 70),
+            ("stein2d-v0", "pf_joint:anneal=0.96", 130),
+            ("stein3d-v0", "pose_graph:robust=gnc:every=40", 40),
+        ),
     ],
 )
 def test_teams_find_each_other(name: str, agent: str, steps: int) -> None:
