@@ -45,6 +45,7 @@ LOCALIZERS = Registry(
         "pf500": "agents.particle.pf:Pf500",
         "pf800": "agents.particle.pf:Pf800",
         "pf_auxiliary": "agents.particle.auxiliary:AuxiliaryParticleFilter",
+        "pf_corrected": "agents.particle.pf_corrected:CorrectedParticleFilter",
         "pf_joint": "agents.particle.pf_joint:TeamParticleFilter",
         "pf_mixture": "agents.particle.mixture:MixtureParticleFilter",
         "pf_rao_blackwell": "agents.particle.rao_blackwell:RaoBlackwellFilter",

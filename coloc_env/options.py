@@ -85,6 +85,7 @@ Ratio = Annotated[float, Quantity("", 0.0)]
 Factor = Annotated[float, Quantity("", above=0.0)]
 Count = Annotated[int, Quantity("", 0)]
 PositiveCount = Annotated[int, Quantity("", 1)]
+Uavs = Annotated[int, Quantity("", 1, 10_000)]  # beyond, all pairs of them fit in no memory
 
 
 class Group:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from coloc_env.motion import Arena, Motion
 from coloc_env.network import Links, Network
-from coloc_env.options import Group, Metres, PositiveCount, PositiveSpeed, Radians, Share
+from coloc_env.options import Group, Metres, PositiveSpeed, Radians, Share, Uavs
 from coloc_env.reference import SatelliteReference
 from coloc_env.sensors import Sensor, Sight
 from coloc_env.sensors.base import Layout, require
@@ -97,7 +97,7 @@ class TeamOptions(Group):
 
     title: ClassVar[str] = "team"
 
-    n_uavs: PositiveCount = 6
+    n_uavs: Uavs = 6
     failure_rate: Share = 0.0
     reward: Reward = "error"
 

@@ -4,10 +4,11 @@ by condensed graphs (DDF-SAM, Cunningham, Paluri & Dellaert 2010)."""
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float32, Float64, Int64
-from tensordict import TensorClass
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from agents.association import AssociationName, associated
+from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.chain import Chain, Smoothed, smooth
 from agents.factor_graph.condensed import arrived, condensed, tie
 from agents.factor_graph.mapped import MappedFactorGraph
@@ -21,7 +22,7 @@ from agents.models.measurements import (
 )
 from agents.models.process import make_process
 from agents.models.update import information
-from agents.robust import SoftName, Trust, soft_trust
+from agents.robust import Prediction, SoftName, Trust, soft_trust
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount, Quantity
@@ -29,22 +30,8 @@ from coloc_env.scenario import Believed
 from coloc_env.sensors import UnmappedLandmarks
 from coloc_env.sensors.base import Layout
 
+_GATE = 0.999  # of a landmark's pairing
 Exchange = Literal["local", "all", "none"]
-
-
-class SmootherBelief(TensorClass):
-    """The window's W states and what was sensed (``window``) and heard of neighbours (``heard``:
-    positions, variances) in them, the newest last; what is known of the second of them from before
-    (``prior``, ``prior_covariance``), steps taken, and the condensed graphs sent last, the newest
-    last; batch (B, N)."""
-
-    states: Float64[Tensor, "B N W S"]
-    window: Float32[Tensor, "B N W F"]
-    heard: Float64[Tensor, "B N W H"]
-    prior: Float64[Tensor, "B N S"]
-    prior_covariance: Float64[Tensor, "B N E E"]
-    step: Int64[Tensor, "B N"]
-    sent: Float64[Tensor, "B N A L"]
 
 
 class DistributedFactorGraph(Localizer[SmootherBelief]):
@@ -60,10 +47,12 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
     common counts again and again. ``none``: no ranges.
 
     Landmarks that nobody knows (``landmarks_known=false``) are variables of the graph: see
-    ``MappedFactorGraph``.
+    ``MappedFactorGraph``. Those that come without names get them once, by the prediction of the
+    newest state, within their 99.9 % gate (``association`` as ``ekf`` has it).
     """
 
     name = "dfgo"
+    associates = True
 
     def __init__(
         self,
@@ -73,6 +62,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         iterations: PositiveCount = 2,
         robust: SoftName = "huber",
         exchange: Exchange = "local",
+        association: AssociationName = "joint",
     ) -> None:
         super().__init__(believed)
         self.size, self.iterations = window, iterations
@@ -83,6 +73,9 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         self.shared = [m for m in models if m.cooperative and exchange == "local"]
         layout = Layout(believed.arena, believed.slots)
         self.leaves = [name for s in believed.sensors for name in s.leaves(layout)]
+        self.association = associated(believed, self.process, association, _GATE)
+        if self.association is not None:
+            self.leaves += ["landmarks", "landmark_mask"]
         self.age = 1 + believed.message_delay
 
     @classmethod
@@ -101,6 +94,9 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
 
     def reset(self, observation: Observation) -> SmootherBelief:
         x, covariance = self.process.initial(observation["prior"].double())
+        spread = self._spread(covariance)
+        if self.association is not None:
+            observation = self.association.unseen(observation)
         b, n, w, d = *x.shape[:2], self.size, self.process.dim
         states = x.unsqueeze(2).expand(-1, -1, w, -1).clone()
         width = self._row(observation).shape[-1]
@@ -114,6 +110,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
             prior_covariance=covariance,
             step=torch.zeros(b, n, dtype=torch.int64, device=x.device),
             sent=x.new_full((b, n, self.age, sent), torch.nan),
+            spread=spread,
             batch_size=(b, n),
         )
 
@@ -121,6 +118,7 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         self, belief: SmootherBelief, observation: Observation
     ) -> tuple[SmootherBelief, Estimate]:
         process, step = self.process, belief.step
+        observation = self._named(belief, observation)
         x, window, heard, leaves = self.entered(belief, observation)
         for _ in range(self.iterations):
             at, found = x, self._solved(x, belief, leaves, heard)
@@ -143,8 +141,25 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
             prior_covariance=found.next_covariance,
             step=step + 1,
             sent=sent,
+            spread=self._spread(found.covariance[..., -1, :, :]),
         )
         return after, gaussian_estimate(process, state, covariance)
+
+    def _spread(self, covariance: Float64[Tensor, "B N E E"]) -> Float64[Tensor, "B N E G"]:
+        """What is kept of the newest state's covariance."""
+        return covariance if self.association is not None else covariance[..., :0]
+
+    def _named(self, belief: SmootherBelief, observation: Observation) -> Observation:
+        """The observation with landmarks' names, by the prediction of the newest state."""
+        if self.association is None:
+            return observation
+        process, newest = self.process, belief.states[:, :, -1]
+        u, dt = process.inputs(observation), elapsed(process, belief.step).double()
+        f, q = process.linearize(newest, u, dt)
+        spread = f @ belief.spread @ f.mT + q
+        nothing = newest[..., :0]
+        prior = Prediction(process.propagate(newest, u, dt), spread, observation, nothing)
+        return self.association.named(prior).observation
 
     # ---------------------------------------------------------------- own factors
 

@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from agents.association import AssociationName
 from agents.errors import NotServed
+from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.chain import Chain, Smoothed, block_diagonal, smooth
-from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
+from agents.factor_graph.dfgo import DistributedFactorGraph
 from agents.models.measurements import Block, Neighbours, make_measurements
 from agents.robust import SoftName
 from coloc_env.observation import Observation
@@ -18,7 +20,8 @@ from coloc_env.scenario import Believed
 
 class CentralFactorGraph(DistributedFactorGraph):
     """Fixed-lag smoother of the team's joint state over its last ``window`` steps, all ranges in
-    one graph, whatever the network. ``iterations`` and ``robust`` as ``dfgo`` has them.
+    one graph, whatever the network. ``iterations``, ``robust`` and ``association`` as ``dfgo`` has
+    them.
 
     Its belief holds each UAV's rows of the joint covariance.
     """
@@ -33,9 +36,15 @@ class CentralFactorGraph(DistributedFactorGraph):
         window: Annotated[int, Quantity("steps", 2, 200)] = 20,
         iterations: PositiveCount = 4,
         robust: SoftName = "huber",
+        association: AssociationName = "joint",
     ) -> None:
         super().__init__(
-            believed, window=window, iterations=iterations, robust=robust, exchange="none"
+            believed,
+            window=window,
+            iterations=iterations,
+            robust=robust,
+            exchange="none",
+            association=association,
         )
         if believed.slots != believed.arena.n_uavs:
             raise NotServed("estimates all UAVs at once: each needs a slot for every other")

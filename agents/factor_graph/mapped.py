@@ -10,6 +10,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.errors import NotServed
+from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.bordered import Bordered, Shared, Solved, solve
 from agents.factor_graph.chain import block_diagonal
 from agents.factor_graph.condensed import Common, arrived, condensed, tie
@@ -22,7 +23,7 @@ from coloc_env.observation import Observation
 from coloc_env.sensors import UnmappedLandmarks
 
 if TYPE_CHECKING:
-    from agents.factor_graph.dfgo import DistributedFactorGraph, SmootherBelief
+    from agents.factor_graph.dfgo import DistributedFactorGraph
 
 
 class MappedBelief(TensorClass):
@@ -100,7 +101,7 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         e = process.error_size
         states, onward = solved.states, solved.next
         after = build(
-            type(track),
+            SmootherBelief,
             track.step.shape,
             states=x,
             window=window,
@@ -109,6 +110,7 @@ class MappedFactorGraph(Localizer[MappedBelief]):
             prior_covariance=states.next_covariance.view(b, n, e, -1),
             step=track.step + 1,
             sent=sent,
+            spread=track.spread,
         )
         whole = onward.precision.view(b, -1, self.size, self.size).expand(b, n, -1, -1)
         mapped = build(

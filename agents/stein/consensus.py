@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from coloc_env.geometry import Poses
+from coloc_env.geometry import Poses, Pulls
 
 
 def penalty_steps(
@@ -17,11 +17,13 @@ def penalty_steps(
     x: Float64[Tensor, "B H N m P"],
     received: Float64[Tensor, "B H R N P"],
     active: Bool[Tensor, "B H R"],
-) -> Float64[Tensor, "B H R N m D"]:
-    """log(x_j⁻¹ c[r, h, j]): steps of each particle to the other ends' dual variables
-    (``received``), the gradient of the penalty γ/2 ‖x + z/γ‖² over −γ (equation 21, line 2)."""
-    steps = poses.minus(received.unsqueeze(-2), x.unsqueeze(2))
-    return torch.where(active[..., None, None, None], steps, 0.0)
+) -> Pulls:
+    """Σ_r log(x_j⁻¹ c[r, h, j]) over ``active`` edges: each particle's steps to the dual variables
+    ``received`` from their other ends, the gradient of the penalty γ/2 ‖x + z/γ‖² over −γ
+    (equation 21, line 2); and the sums of their squares."""
+    heard = torch.where(active[..., None, None], received, poses.identity(x))
+    weight = active.to(x.dtype).unsqueeze(2).expand(-1, -1, x.shape[2], -1)
+    return poses.pulls(x, heard.transpose(2, 3).contiguous(), weight)
 
 
 def dual_update(

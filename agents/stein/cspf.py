@@ -27,6 +27,7 @@ from agents.stein.team import RelativeTeam
 from agents.stein.update import kernel, stein_step
 from agents.tensorclasses import build
 from coloc_env import noise
+from coloc_env.geometry import Pulls
 from coloc_env.observation import Observation
 from coloc_env.options import Factor, OpenShare, PositiveCount, PositiveShare, Ratio, Share
 from coloc_env.scenario import Believed
@@ -239,8 +240,8 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         steps, log_density = target.steps, target.log_density
         if self.consensus:
             penalty = consensus.penalty_steps(poses, x, received, active)
-            steps = steps + self.gamma * penalty.sum(2)
-            log_density = log_density - 0.5 * self.gamma * self._squares(penalty, inputs.scale)
+            steps = steps + self.gamma * penalty.tangent
+            log_density = log_density - 0.5 * self.gamma * _in_units(penalty, inputs.scale)
         weight = target.weight + self.gamma * (n - 1)  # H, block-diagonal
         near = kernel(poses, x, inputs.scale)
         steps = steps / weight.repeat_interleave(self._parts.to(x.device), -1)  # H⁻¹ b, eq. 17
@@ -262,12 +263,9 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         beta = torch.zeros_like(inputs.beta) if self.literal else inputs.beta
         return fit_neighbours(self.poses, x, inputs.window, inputs.scale, beta, inputs.active)
 
-    def _squares(
-        self, tangent: Float64[Tensor, "B H R N m D"], scale: Scale
-    ) -> Float64[Tensor, "B H m"]:
-        """Squared distances to the other ends' dual variables, in units of the scale, summed."""
-        d, squares = self.poses.dim, tangent.square()
-        position, turn = squares[..., :d].sum((2, 3, 5)), squares[..., d:].sum((2, 3, 5))
-        return position / scale.position.square().unsqueeze(
-            -1
-        ) + turn / scale.turn.square().unsqueeze(-1)
+
+def _in_units(penalty: Pulls, scale: Scale) -> Float64[Tensor, "B H m"]:
+    """Squared distances to the other ends' dual variables, in units of the scale, summed over
+    agents."""
+    position = penalty.position.sum(2) / scale.position.square().unsqueeze(-1)
+    return position + penalty.turn.sum(2) / scale.turn.square().unsqueeze(-1)

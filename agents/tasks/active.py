@@ -13,7 +13,7 @@ from agents.tasks.memory import TaskMemory, own_covariance
 from agents.tasks.options import SteeredTaskOptions
 from agents.tasks.rules import Seen, idle, random_policy, steer, towards
 from agents.tasks.task import Task
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import AnchorRanging, Ranging
 from coloc_env.world import World
@@ -74,7 +74,7 @@ class Active(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 6,
+        n_uavs: Uavs = 6,
         anchors: PositiveCount = 4,
         horizon: PositiveCount = 80,
         task: SteeredTaskOptions = SteeredTaskOptions("ekf_joint", control="acceleration"),

@@ -16,7 +16,7 @@ from coloc_env.commands import SILENT, Commands
 from coloc_env.motion import Roam
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -91,7 +91,7 @@ class Beacon(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 10,
+        n_uavs: Uavs = 10,
         horizon: PositiveCount = 100,
         drift: Drift = 0.3,
         task: TaskOptions = TaskOptions("ekf:fusion=ci:second_order=true", credit="own"),

@@ -12,7 +12,7 @@ from agents.tasks.rules import Seen, idle, random_policy, steer, towards
 from agents.tasks.space import CRUISE, Space
 from agents.tasks.task import Task, sensors, task_scenario
 from coloc_env.network import Network
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -86,7 +86,7 @@ class Convoy(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 4,
+        n_uavs: Uavs = 4,
         horizon: PositiveCount = 120,
         drift: Drift = 0.3,
         task: SteeredTaskOptions = SteeredTaskOptions(),

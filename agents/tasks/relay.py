@@ -15,7 +15,7 @@ from agents.tasks.space import CRUISE, Space
 from agents.tasks.task import MOST_ERROR, Task, sensors, task_scenario
 from coloc_env.motion import Groups, Roam
 from coloc_env.network import Network
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -135,7 +135,7 @@ class Relay(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 5,
+        n_uavs: Uavs = 5,
         scouts: PositiveCount = 2,
         horizon: PositiveCount = 100,
         drift: Drift = 0.1,

@@ -16,7 +16,7 @@ from coloc_env.commands import SILENT, Commands
 from coloc_env.motion import Roam
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -130,7 +130,7 @@ class Schedule(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 6,
+        n_uavs: Uavs = 6,
         horizon: PositiveCount = 100,
         drift: Drift = 0.25,
         task: TaskOptions = TaskOptions(credit="own"),

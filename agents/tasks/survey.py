@@ -15,7 +15,7 @@ from agents.tasks.space import Space
 from agents.tasks.task import Task, sensors, task_scenario
 from coloc_env.network import Network
 from coloc_env.observation import Observation
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -116,7 +116,7 @@ class Survey(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 4,
+        n_uavs: Uavs = 4,
         horizon: PositiveCount = 80,
         drift: Drift = 0.15,
         task: SteeredTaskOptions = SteeredTaskOptions(),

@@ -14,7 +14,7 @@ from agents.tasks.space import Space
 from agents.tasks.task import MOST_ERROR, Task, sensors, task_scenario
 from coloc_env.motion import Groups, RandomWalk
 from coloc_env.network import Network
-from coloc_env.options import PositiveCount
+from coloc_env.options import PositiveCount, Uavs
 from coloc_env.scenario import Prior
 from coloc_env.world import World
 
@@ -87,7 +87,7 @@ class Track(Task):
     def __init__(
         self,
         *,
-        n_uavs: PositiveCount = 4,
+        n_uavs: Uavs = 4,
         targets: PositiveCount = 3,
         horizon: PositiveCount = 100,
         drift: Drift = 0.3,

@@ -21,6 +21,7 @@ _FAR = 3.0  # robust deviations beyond which a range is an outlier
 _LATE = 0.05  # s
 _MANY = 30  # ranges, of fewer of which a share says nothing
 _G = 9.80665
+_TIES = {"uav_ranges": 1, **dict.fromkeys(("uav_bearings", "arrival_angles", "uav_rssi"), 0)}
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,8 @@ def _about_imu(recording: Recording) -> list[tuple[int, str]]:
 def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     """Robots whose place nothing shows, and maps that leave a mirror image."""
     fixed = {
-        "anchor_ranges", "landmark_bearings", "landmark_vectors", "position_fix", "tdoa"
+        "anchor_ranges", "landmark_bearings", "landmark_vectors", "position_fix", "tdoa",
+        "rssi", "light", "ultrasonic",
     } & recording.streams.keys()  # fmt: skip
     reached = {
         robot
@@ -183,7 +185,7 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     }
     ties = [
         (robot, int(other))
-        for stream, column in (("uav_ranges", 1), ("uav_bearings", 0), ("arrival_angles", 0))
+        for stream, column in _TIES.items()
         for robot, table in enumerate(recording.streams.get(stream, ()))
         for other in np.unique(table.values[:, column])
     ]

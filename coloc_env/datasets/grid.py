@@ -19,7 +19,11 @@ _TRUTH_HOLE = 1_000_000_000  # ns: and in an interval longer than this,
 _TRUTH_BESIDE = 10_000_000  # ns: this close
 _LEAST_DT = 0.001  # s
 _PHASES = 32  # of a step, tried
-LINKS = {"uav_ranges": 3, "anchor_ranges": 2, "landmark_vectors": 1}  # columns that name one
+LINKS = {  # how many columns name one
+    "uav_ranges": 3,
+    "anchor_ranges": 2,
+    **dict.fromkeys(("landmark_vectors", "rssi", "uav_rssi", "light"), 1),
+}
 _LASTING = 1.0  # s, for which an acceleration or a rate that was not measured lasts
 
 

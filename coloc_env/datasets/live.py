@@ -20,6 +20,7 @@ from coloc_env.datasets.open_format import streams
 from coloc_env.datasets.open_format.columns import Columns, check_numbers
 from coloc_env.datasets.open_format.description import Description
 from coloc_env.datasets.open_format.reader import described
+from coloc_env.datasets.open_format.senses import BEAMS
 from coloc_env.datasets.open_format.stamps import DIGITS, nanoseconds
 from coloc_env.datasets.recording import (
     IMU_COLUMNS,
@@ -43,6 +44,11 @@ _COLUMNS = {
     "tdoa": ("own_tag", "from", "to", "difference"),
     "arrival_angles": ("robot", "azimuth", "elevation"),
     "flow": ("vx", "vy"),
+    "compass": ("heading",),
+    "rssi": ("point", "strength"),
+    "uav_rssi": ("robot", "strength"),
+    "light": ("lamp", "intensity", "x", "y", "z"),
+    "ultrasonic": BEAMS,
     "height": ("height",),
     "position_fix": ("x", "y", "z"),
 }

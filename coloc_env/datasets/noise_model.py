@@ -143,6 +143,43 @@ class FlowModel:
 
 
 @dataclass(frozen=True)
+class CompassModel:
+    """Headings: ``std`` rad."""
+
+    std: float = 0.1
+
+
+@dataclass(frozen=True)
+class StrengthModel:
+    """Signal strengths: ``power`` dBm at 1 m, less 10 ``exponent`` dB for each tenfold distance,
+    ``std`` dB."""
+
+    std: float = 4.0
+    power: float = -40.0
+    exponent: float = 2.2
+
+
+@dataclass(frozen=True)
+class LightModel:
+    """Lamps that shine down: ``power`` lx at 1 m below, ``ambient`` lx of other light, noise of a
+    ``share`` and a ``floor`` lx, directions to ``angle_std`` rad."""
+
+    power: float = 1000.0
+    ambient: float = 20.0
+    share: float = 0.05
+    floor: float = 0.5
+    angle_std: float = 0.05
+
+
+@dataclass(frozen=True)
+class EchoModel:
+    """Distances to walls: ``std`` m, none beyond ``reach`` m."""
+
+    std: float = 0.03
+    reach: float = 4.0
+
+
+@dataclass(frozen=True)
 class MotionModel:
     """``model``: one of ``MODELS``, or ``auto`` (by what the recording has). Of a constant
     velocity: white acceleration ``accel_std`` (m/s²/√Hz), ``damping`` s (0: none). ``slow_flight``:
@@ -170,6 +207,11 @@ class NoiseModel:
     tdoa: TdoaModel = TdoaModel()
     arrival_angles: AngleModel = AngleModel()
     flow: FlowModel = FlowModel()
+    compass: CompassModel = CompassModel()
+    rssi: StrengthModel = StrengthModel()
+    uav_rssi: StrengthModel = StrengthModel()
+    light: LightModel = LightModel()
+    ultrasonic: EchoModel = EchoModel()
     height: HeightModel = HeightModel()
     position_fix: FixModel = FixModel()
     anchors: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

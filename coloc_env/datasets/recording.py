@@ -110,6 +110,10 @@ class Recording:
     - ``tdoa``: own_tag, from, to (indices of anchors), difference m: how much farther ``to`` is
     - ``arrival_angles``: robot (index), azimuth rad (counter-clockwise), elevation rad; body frame
     - ``flow``: vx, vy m/s in the body frame
+    - ``compass``: heading rad
+    - ``rssi``, ``uav_rssi``: point or robot (index), strength dBm
+    - ``light``: lamp (index), intensity lx, x, y, z of the lamp's direction in the body frame
+    - ``ultrasonic``: forward, back, left, right, up, down m; NaN where there is no echo
     - ``height``: height m above the world's origin
     - ``magnetometer``: x, y, z tesla, body frame
     - ``landmark_vectors``, ``uav_vectors``: landmark or robot (index), x, y, z m in the body frame
@@ -127,6 +131,8 @@ class Recording:
         anchors: [A, d] metres, world frame.
         tags: [N, K, d] lever arms of the ranging tags in the body frame, metres; K = 0 without
             tags, rows of NaN where a robot has fewer than K.
+        places: what else is on the map, name to [d] metres, by kind: ``lamps``,
+            ``access_points``, and the ``low`` and ``high`` corner of a ``room``.
         source: citation and licence.
         origin: [d] metres: where the origin of all that stands here is in the world frame that was
             recorded.
@@ -159,6 +165,7 @@ class Recording:
     epoch: int = 0
     points: tuple[Table, ...] = ()
     start: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    places: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
 
     @property
     def tracked(self) -> bool:
@@ -184,6 +191,11 @@ class Recording:
             if array.ndim != 2 or array.shape[1] != self.dim:
                 raise ValueError(f"Recording.{what} has shape {array.shape}, not [n, {self.dim}]")
             check_places(f"Recording.{what}", array)
+        for kind, places in self.places.items():
+            for name, place in places.items():
+                if place.shape != (self.dim,):
+                    raise ValueError(f"Recording.places: {kind} {name} has shape {place.shape}")
+                check_places(f"Recording.places: {kind} {name}", place)
         if self.tags.ndim != 3 or self.tags.shape[::2] != (robots, self.dim):
             raise ValueError(f"Recording.tags has shape {self.tags.shape}, not [{robots}, K, d]")
 
@@ -222,6 +234,10 @@ def near_origin(recording: Recording) -> Recording:
         origin=tuple((origin + before).tolist()),
         points=_shifted(recording.points, origin),
         start=start,
+        places={
+            kind: {name: place - origin for name, place in places.items()}
+            for kind, places in recording.places.items()
+        },
     )
 
 

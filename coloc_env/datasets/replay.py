@@ -86,6 +86,7 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
     dim = recording.dim
     points = [track.position for track in recording.truth]
     points += [p for p in (recording.landmarks, recording.anchors) if len(p)]
+    points += [place[None] for places in recording.places.values() for place in places.values()]
     points += [table.values for table in (*recording.points, *recording.streams.get(_FIX, ()))]
     if len(recording.start):
         points.append(recording.start[~np.isnan(recording.start[:, :dim]).any(1), :dim])
@@ -252,7 +253,7 @@ def recorded_landmarks(recording: Recording, grid: Grid, sensor: Landmarks) -> R
     """Leaves ``landmarks`` and ``landmark_mask``: vectors to landmarks in the body frame."""
     slots = [t.values[:, 0].astype(np.int64) for t in recording.streams["landmark_vectors"]]
     count, dim = len(recording.landmarks), recording.dim
-    values, there = _once(recording, grid, "landmark_vectors", slots, count, slice(1, 1 + dim))
+    values, there = once(recording, grid, "landmark_vectors", slots, count, slice(1, 1 + dim))
     return RecordedSensor(
         sensor,
         {
@@ -297,11 +298,11 @@ def _ranges(
     count: int,
     columns: slice,
 ) -> tuple[Series, Series]:
-    values, there = _once(recording, grid, stream, slots, count, columns)
+    values, there = once(recording, grid, stream, slots, count, columns)
     return as_series([each[..., 0] for each in values]), as_series(there)
 
 
-def _once(
+def once(
     recording: Recording,
     grid: Grid,
     stream: str,

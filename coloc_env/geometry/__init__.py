@@ -1,7 +1,7 @@
 """Rotations and poses in the plane and in space; conventions in ``rotations`` and ``poses``."""
 
 from coloc_env.geometry.pairs import pair_differences, pair_distances
-from coloc_env.geometry.poses import Poses
+from coloc_env.geometry.poses import Poses, Pulls
 from coloc_env.geometry.rotations import (
     concat,
     cross,
@@ -33,6 +33,7 @@ def poses_in(dim: int) -> type[Poses]:
 
 __all__ = [
     "Poses",
+    "Pulls",
     "Se2",
     "Se3",
     "concat",

@@ -9,13 +9,22 @@ numbers, finite at zero and at half turns.
 """
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from coloc_env.geometry.rotations import rotate
+
+
+class Pulls(NamedTuple):
+    """Sums over other poses of tangents that lead to them: of the tangents themselves, and of the
+    squares of their position part (m²) and turn part (rad²)."""
+
+    tangent: Float[Tensor, "*s m D"]
+    position: Float[Tensor, "*s m"]
+    turn: Float[Tensor, "*s m"]
 
 
 class Poses(ABC):
@@ -78,6 +87,20 @@ class Poses(ABC):
     def minus(cls, y: Float[Tensor, "*s P"], x: Float[Tensor, "*s P"]) -> Float[Tensor, "*s D"]:
         """``y ⊟ x = log(x⁻¹ y)``: the tangent at ``x`` that leads to ``y``."""
         return cls.log(cls.between(x, y))
+
+    @classmethod
+    def pulls(
+        cls, x: Float[Tensor, "*s m P"], y: Float[Tensor, "*s n P"], weight: Float[Tensor, "*s n"]
+    ) -> Pulls:
+        """``Σ_n w_n (y_n ⊟ x_m)``, and the same sums of squares."""
+        tangent = cls.minus(y.unsqueeze(-2), x.unsqueeze(-3))
+        weight = weight[..., None, None]
+        squares = weight * tangent.square()
+        return Pulls(
+            (weight * tangent).sum(-3),
+            squares[..., : cls.dim].sum((-3, -1)),
+            squares[..., cls.dim :].sum((-3, -1)),
+        )
 
     @classmethod
     def act(cls, x: Float[Tensor, "*s P"], point: Float[Tensor, "*s d"]) -> Float[Tensor, "*s d"]:

@@ -88,6 +88,10 @@ def indoor(
     """
     if anchors.nlos_anchor is not None and not anchors.anchors:
         raise ValueError(f"nlos_anchor={anchors.nlos_anchor} is not allowed: there are no anchors")
+    if anchors.biased_anchors and not anchors.anchors:
+        raise ValueError(
+            f"biased_anchors={anchors.biased_anchors} is not allowed: there are no anchors"
+        )
     if landmarks.association == "unknown" and not mapping.landmarks_known:
         raise ValueError("association=unknown is not allowed with landmarks_known=false")
     arena = Arena(3, team.n_uavs, dt, (0.0, 0.0, 0.0), room)

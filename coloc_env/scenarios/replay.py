@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +35,7 @@ from coloc_env.datasets.replay import (
     recorded_odometry,
     recorded_ranges,
 )
+from coloc_env.datasets.senses import Read, believed_senses
 from coloc_env.datasets.starts import level, spread_of_start
 from coloc_env.network import Network
 from coloc_env.scenario import (
@@ -230,7 +231,14 @@ def _sensors(recording: Recording, model: NoiseModel) -> dict[str, Make]:
         upwards = model.position_fix.vertical_std or None
         fix = PositionFix(model.position_fix.std, len(recording.robots), upwards)
         makers["position_fix"] = lambda r, g: (recorded_fixes(r, g, fix), fix)
-    return makers
+    return makers | {
+        stream: partial(_sensed, read, sensor)
+        for stream, (read, sensor) in believed_senses(recording, model).items()
+    }
+
+
+def _sensed(read: Read, sensor: Sensor, recording: Recording, grid: Grid) -> Pair:
+    return read(recording, grid, sensor), sensor
 
 
 def _bearings(recording: Recording, grid: Grid, sensor: LandmarkBearings | UavBearings) -> Pair:

@@ -1,7 +1,7 @@
 """Sensors: what each UAV measures of the truth."""
 
 from coloc_env.sensors.angles import AngleOptions, ArrivalAngles
-from coloc_env.sensors.base import Layout, Leaf, RecordedSensor, Sensor, Window
+from coloc_env.sensors.base import MASK, Layout, Leaf, RecordedSensor, Sensor, Window
 from coloc_env.sensors.bearings import LandmarkBearings, UavBearings
 from coloc_env.sensors.compass import Compass, CompassOptions
 from coloc_env.sensors.displacement import Displacement
@@ -30,6 +30,7 @@ from coloc_env.sensors.unmapped import MapOptions, UnmappedLandmarks
 
 __all__ = [
     "GRAVITY",
+    "MASK",
     "AnchorRanging",
     "AnchorUavOptions",
     "AngleOptions",

@@ -169,12 +169,32 @@ class TagOptions(Group):
 
 
 @dataclass(frozen=True)
+class AnchorOffset:
+    """A bias of ``size`` m that all ranges to the first ``anchors`` share, grown linearly from 0
+    over the first ``rise`` s."""
+
+    anchors: int = 0
+    size: float = 1.0
+    rise: float = 0.0
+
+    def at(
+        self, steps: Int64[Tensor, "R K"], dt: float, count: int
+    ) -> Float32[Tensor, "R K 1 1 A"]:
+        """Biases (m) of so many anchors in steps of dt s."""
+        time = (steps * dt).to(torch.float32)
+        share = (time / self.rise).clamp_max(1.0) if self.rise else torch.ones_like(time)
+        biased = torch.arange(count, device=steps.device) < self.anchors
+        return self.size * share[..., None, None, None] * biased
+
+
+@dataclass(frozen=True)
 class AnchorRanging(Sensor):
     """Leaves ``anchor_ranges`` and ``anchor_range_mask`` [T · A], and ``anchor_map`` [A · d].
 
     Entry ``a · A + m`` is between the UAV's own tag ``a`` and anchor ``m``, within ``radius`` m.
     ``blocked``: indices of anchors behind an obstacle, whose ranges all carry the noise's NLOS
-    bias. ``walls``: solid boxes that no range passes; ``sight``: what else is in the way.
+    bias; ``offset``: a bias of some. ``walls``: solid boxes that no range passes; ``sight``: what
+    else is in the way.
     """
 
     anchors: tuple[tuple[float, ...], ...]
@@ -184,8 +204,11 @@ class AnchorRanging(Sensor):
     blocked: tuple[int, ...] = ()
     walls: tuple[Box, ...] = ()
     sight: Sight = field(default_factory=Sight)
+    offset: AnchorOffset = field(default_factory=AnchorOffset)
 
     def __post_init__(self) -> None:
+        most = len(self.anchors)
+        require(0 <= self.offset.anchors <= most, self, "offset", f"of at most {most} anchors")
         require(len(self.anchors) > 0, self, "anchors", "at least one anchor position")
         known = all(0 <= anchor < len(self.anchors) for anchor in self.blocked)
         require(known, self, "blocked", f"indices of the {len(self.anchors)} anchors")
@@ -228,6 +251,9 @@ class AnchorRanging(Sensor):
         bias = self.noise.biases(window, index, "anchor_ranging")
         if bias is not None:
             ranges = ranges.add_(bias)
+        if self.offset.anchors:
+            dt = window.layout.arena.dt
+            ranges = ranges + self.offset.at(window.steps, dt, len(self.anchors))
         out, through = self.noise.out(window, index, "anchor_ranging"), None
         if not self.sight.clear:
             through = self.sight.between(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from agents import LOCALIZERS
-from agents.factor_graph.dfgo import SmootherBelief
+from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.mapped import MappedBelief
 from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation

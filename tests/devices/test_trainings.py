@@ -30,6 +30,13 @@ TASK = {"worlds": 2, "epochs": 1, "hidden": 8, "score_worlds": 0}
 TASK_PPO = TASK | {"passes": 1, "minibatches": 2}
 KINDS: dict[str, dict[str, Any]] = {
     "pfnn": LEAST | {"scenario": ROOM, "passes": 1, "minibatch": 100},
+    "pf_corrected": LEAST
+    | {
+        "scenario": "indoor-v0:n_uavs=2:horizon=4",
+        "variants": "landmarks=2:anchors=4",
+        "steps": 4,
+        "particles": 20,
+    },
     "dlspf": LEAST | {"scenario": ROOM.replace("20", "24"), "passes": 1},
     "nnhpff": LEAST
     | {

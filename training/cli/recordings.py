@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, cast, get_args
 
 import typer
@@ -95,7 +96,7 @@ def recordings(
             name = f"{one.dataset}/{one.sequence}"
             tuned[name] = one.sequence in scenario.tuned_on
             figures[name] = all_of_them.measure(scenario, names, runs, seed, bars)
-            command = f"coloc recordings --agents {agents} --runs {runs} --seed {seed}"
+            command = f"coloc recordings --agents {quote(agents)} --runs {runs} --seed {seed}"
             table = all_of_them.table(
                 figures, tuned, names, runs, seed, command, "measured by this command"
             )

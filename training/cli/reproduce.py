@@ -33,8 +33,9 @@ def reproduce(
         typer.Option(
             metavar="PART",
             help="**paper**: its own tables and figures; **robustness** (pfnn, nnhpff, cspf); "
-            "**stress**, **learned**, **campus** (stdcl); **real**: recordings (stdcl, cspf); "
-            "**all**.",
+            "**rivals**, **regimes**, **corrector** (pfnn); **detector**, **noise**, **bias** "
+            "(nnhpff); **stress**, **learned**, **campus**, **theory**, **factors** (stdcl); "
+            "**real**: recordings (stdcl, cspf); **all**.",
         ),
     ] = "all",
     runs: Annotated[

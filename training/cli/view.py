@@ -11,8 +11,18 @@ import typer
 from training.cli.options import Data, Seed, Settings, Threads, build_scenario, require_seed
 from training.cli.terminal import progress
 
+_OF_A_SCENARIO = {
+    "agent": "--agent",
+    "steps": "--steps",
+    "seed": "--seed",
+    "settings": "--set",
+    "threads": "--threads",
+    "data": "--data",
+}
+
 
 def view(
+    context: typer.Context,
     what: Annotated[
         str,
         typer.Argument(metavar="SCENARIO|RUN", help="A scenario, or the folder of an evaluation."),
@@ -47,6 +57,7 @@ def view(
     from coloc_env.staging import staged_file
 
     if Path(what).is_dir():
+        _require_no_scenario(context, what)
         from training.evaluation.runs import read
         from training.evaluation.viewing import view_runs
 
@@ -75,3 +86,11 @@ def view(
         subprocess.Popen([sys.executable, "-m", "rerun", str(out)], start_new_session=True)
     elif show:
         typer.echo(f"no screen here: open it with `rerun {out}`")
+
+
+def _require_no_scenario(context: typer.Context, folder: str) -> None:
+    """Raise ValueError for options of a scenario beside the folder of an evaluation."""
+    for name, option in _OF_A_SCENARIO.items():
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise ValueError(f"{option} is for a scenario: {folder} is a folder, shown as it is")

@@ -1,5 +1,6 @@
 """What a dataset holds: its runs, in which parts they are written, and its columns."""
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,11 +105,13 @@ class Plan:
         return facts | {"runs": self.runs, "steps": self.steps, "agent": self.agent}
 
     def command(self, out: str) -> str:
-        """The command that writes it."""
-        words = ["coloc dataset", self.scenario.name, f"--runs {self.runs}", f"--seed {self.seed}"]
+        """The command that writes it, as a shell reads it."""
+        words = ["coloc", "dataset", self.scenario.name]
+        words += ["--runs", str(self.runs), "--seed", str(self.seed)]
         if self.steps != self.scenario.horizon:
-            words.append(f"--steps {self.steps}")
+            words += ["--steps", str(self.steps)]
         if self.agent is not None:
-            words.append(f"--agent {self.agent}")
-        words += [f"--set {key}={typed(value)}" for key, value in self.scenario.overrides.items()]
-        return " ".join([*words, f"--out {out}"])
+            words += ["--agent", self.agent]
+        for key, value in self.scenario.overrides.items():
+            words += ["--set", f"{key}={typed(value)}"]
+        return shlex.join([*words, "--out", out])

@@ -26,7 +26,7 @@ SIMULATED: Mapping[str, Mapping[str, Any]] = {  # where learned trust gains most
     "false matches": {"false_matches": 0.1},
     "both with five landmarks": {"nlos": 0.3, "false_matches": 0.1, "landmarks": 5},
 }
-WORLDS, STEPS = 24, 300  # of each of these
+WORLDS, STEPS = 8, 300  # of each of these
 _MRCLAM_STD = 0.2  # m, of the noise of its ranges: its biases are believed in multiples of that
 
 
@@ -169,8 +169,8 @@ def _worlds(
 ) -> Iterator[tuple[str, Callable[..., Scenario], torch.Tensor]]:
     """Datasets, what makes each world of them (with more overrides), and its seeds."""
     for one in recorded():
-        biased = which == "bank" or one.dataset in bias_constants()[0].overrides
-        if biased and (only is None or one.dataset in only):
+        serves = which == "bank" or one.dataset in bias_constants()[0].overrides
+        if serves and (only is None or one.dataset in only):
             yield one.dataset, partial(one.scenario, **overrides), torch.tensor([seed])
     if which == "bank":
         for variant in SIMULATED.values():

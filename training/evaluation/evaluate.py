@@ -30,6 +30,7 @@ def silent(what: str, done: int, total: int) -> None:
 
 _FAST = 2**25  # bytes of a batch's beliefs and what is made of them in a step: more fits no cache
 _WORKING_SET = 20  # bytes in use at the height of a step per byte of belief
+_MOST_RUNS = 10_000_000  # of one evaluation: the record of more fits no memory
 _TIMED, _WARM_UP = 50, 5  # steps
 
 
@@ -138,8 +139,8 @@ def _check(agents: Sequence[str], runs: int, seed: int, chunk: int | None) -> No
     twice = next((name for i, name in enumerate(agents) if name in agents[:i]), None)
     if twice is not None:
         raise ValueError(f"agent {twice!r} is named twice")
-    if runs < 1:
-        raise ValueError(f"runs={runs} is not allowed: at least 1")
+    if not 1 <= runs <= _MOST_RUNS:
+        raise ValueError(f"runs={runs} is not allowed: 1 to {_MOST_RUNS}")
     checked_seed(seed, "evaluate")
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk={chunk} is not allowed: at least 1")

@@ -85,6 +85,8 @@ def rollout(
                 raise
             except NUMERICAL as error:
                 raise Breakdown(k, error) from error
+            if k == 0:
+                _require_estimate(localizer, estimate, action.shape[:2], scenario.arena.dim)
             action, finite = finite_action(estimate, action)
         else:
             estimate, finite = None, torch.ones_like(finite)
@@ -92,3 +94,17 @@ def rollout(
         if k + 1 < horizon:
             world.advance(action, None if commands is None else commands(k))
             observation = world.observation()
+
+
+def _require_estimate(localizer: Localizer, estimate: Any, batch: torch.Size, d: int) -> None:
+    """Raise ValueError for what is no Estimate of each UAV, with the shape that is needed."""
+    who = type(localizer).__name__
+    if not isinstance(estimate, Estimate):
+        raise ValueError(
+            f"{who}.step must return a belief and an Estimate, not {type(estimate).__name__}"
+        )
+    for key, shape in (("position", (d,)), ("velocity", (d,)), ("covariance", (d, d))):
+        found = getattr(estimate, key).shape
+        if found != batch + shape:
+            needed = [*batch, *shape]
+            raise ValueError(f"{who}: an estimate's {key} must be {needed}, not {[*found]}")

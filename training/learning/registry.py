@@ -10,6 +10,7 @@ TRAININGS = Registry(
         "ippo": "training.learning.mappo:ippo",
         "mappo": "training.learning.mappo:mappo",
         "nnhpff": "training.learning.nnhpff:nnhpff",
+        "pf_corrected": "training.learning.pf_corrected:pf_corrected",
         "pfnn": "training.learning.pfnn:pfnn",
         "sb3-ppo": "training.learning.sb3_ppo:sb3_ppo",
         "task-ippo": "training.learning.tasks.ppo:task_ippo",

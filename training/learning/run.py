@@ -9,6 +9,7 @@
 import inspect
 import json
 import platform
+import shlex
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -322,10 +323,12 @@ def _config(folder: Path) -> dict[str, Any]:
 
 
 def _command(name: str, chosen: Mapping[str, Any], out: Path, device: str) -> str:
-    """The command line that starts the same run."""
-    settings = "".join(f" --set {key}={typed(value)}" for key, value in chosen.items())
-    where = "" if device == "cpu" else f" --device {device}"
-    return f"coloc train {name}{settings}{where} --out {out}"
+    """The command line that starts the same run, as a shell reads it."""
+    words = ["coloc", "train", name]
+    for key, value in chosen.items():
+        words += ["--set", f"{key}={typed(value)}"]
+    words += [] if device == "cpu" else ["--device", device]
+    return shlex.join([*words, "--out", str(out)])
 
 
 def _versions() -> dict[str, str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from agents.registry import LOCALIZERS
@@ -275,7 +276,7 @@ def _provenance(study: Study, settings: Settings) -> dict[str, Any]:
     usual = {"part": "all", "runs": study.runs, "seed": 0, "steps": None}
     words = [f"--{key} {value}" for key, value in chosen.items() if value != usual[key]]
     lists = {"agents": settings.agents, "variants": settings.variants}
-    words += [f"--{key} {','.join(some)}" for key, some in lists.items() if some is not None]
+    words += [f"--{key} {quote(','.join(some))}" for key, some in lists.items() if some is not None]
     return {
         "command": " ".join(("coloc reproduce", study.key, *words)),
         "commit": _commit(),

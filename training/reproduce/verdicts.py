@@ -181,6 +181,14 @@ def gain(ours: Floats, other: Floats, level: float = 0.95) -> Difference:
     return Difference(*(scale * x for x in (difference.mean, difference.low, difference.high)))
 
 
+def apart(ours: Floats | None, other: Floats | None) -> str:
+    """How much larger an RMSE is than another's, in per cent of that."""
+    if ours is None or other is None:
+        return DASH
+    less = gain(ours, other)
+    return signed(Difference(*(0.0 - x for x in (less.mean, less.high, less.low))), "")
+
+
 def gain_in(measure: Callable[[Runs], Floats]) -> Callable[[Runs, Runs], Difference]:
     """``gain`` of a measure, as a claim's figure of two agents."""
     return lambda one, other: gain(measure(one), measure(other))

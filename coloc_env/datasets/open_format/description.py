@@ -16,6 +16,7 @@ FRAMES = ("enu", "ned", "utm")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 ACCELERATIONS = {"m/s2": 1.0, "g": 9.80665}
+PLACES = ("lamps", "access_points", "room")
 KEYS = (
     "name", "dim", "robots", "frame", "units", "time", "map", "tags", "source", "licence", "origin",
     "exchanges", "start", "dropped", "believed", "streams",
@@ -29,7 +30,8 @@ class Description:
     ``unit``: of stamps; ``epoch``: whether they count from 1970; ``zero``: ns since 1970 at their
     zero, if that is known. ``once``: each exchange of two robots stands in at least one file, and
     both know of it; otherwise each robot knows what stands in its own. ``streams``: those that are
-    to come live (``OnlineLocalizer``); what a folder holds shows in the folder.
+    to come live (``OnlineLocalizer``); what a folder holds shows in the folder. ``places``: what
+    else is on the map, by its kind (``PLACES``).
     """
 
     file: YamlFile
@@ -52,6 +54,7 @@ class Description:
     start: Floats
     dropped: dict[str, int]
     streams: tuple[str, ...]
+    places: dict[str, dict[str, Floats]]
 
 
 def read_description(path: Path) -> Description:
@@ -68,7 +71,8 @@ def read_description(path: Path) -> Description:
     robots = _robots(file, folder)
     file.allow(("units",), ("length", "angle", "acceleration"))
     file.allow(("time",), ("unit", "zero"))
-    file.allow(("map",), ("landmarks", "anchors"))
+    file.allow(("map",), ("landmarks", "anchors", *PLACES))
+    file.allow(("map", "room"), ("low", "high"))
     length = LENGTHS[file.choice(("units", "length"), LENGTHS, "m")]
     angle = ANGLES[file.choice(("units", "angle"), ANGLES, "rad")]
     acceleration = ACCELERATIONS[file.choice(("units", "acceleration"), ACCELERATIONS, "m/s2")]
@@ -80,8 +84,12 @@ def read_description(path: Path) -> Description:
     landmarks, anchors = (_places(file, kind, dim, length) for kind in ("landmarks", "anchors"))
     names = [*robots, *landmarks, *anchors]
     twice = next((name for name in names if names.count(name) > 1), None)
+    places = {kind: _places(file, kind, dim, length) for kind in PLACES}
+    twice = twice or next((name for name in places["access_points"] if name in robots), None)
     if twice is not None:
         file.fail(("map",), f"the name {twice!r} is given twice")
+    if len(places["room"]) == 1:
+        file.fail(("map", "room"), "has one corner: low and high are needed")
     source = file.text("source")
     if licence := file.text("licence"):
         source = f"{source}; {licence}" if source else licence
@@ -107,6 +115,7 @@ def read_description(path: Path) -> Description:
         start=_start(file, robots, dim, length, angle),
         dropped={key: file.whole("dropped", key, default=0) for key in file.mapping("dropped")},
         streams=tuple(file.names("streams")),
+        places=places,
     )
 
 

@@ -89,6 +89,7 @@ def described(about: Description, found: Mapping[str, tuple[Table, ...]]) -> Rec
         anchor_names=tuple(about.anchors),
         epoch=about.zero,
         start=streams.start_in_world(about),
+        places=streams.places_in_world(about),
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_env.datasets.open_format import carried, frames
+from coloc_env.datasets.open_format import carried, frames, senses
 from coloc_env.datasets.open_format.carried import REACH, Made, tags_of
 from coloc_env.datasets.open_format.columns import Columns, Kind
 from coloc_env.datasets.open_format.description import Description
@@ -75,6 +75,18 @@ def start_in_world(about: Description) -> Floats:
         frames.heading(turned, about.frame) if dim == 2 else frames.attitude(turned, about.frame)
     )
     return np.concatenate((frames.world(start[:, :dim], about.frame), turned), 1)
+
+
+def places_in_world(about: Description) -> dict[str, dict[str, Floats]]:
+    """What else is on the map in our frames; kinds of which there is none are not there."""
+    found = {
+        kind: {name: frames.world(place, about.frame) for name, place in places.items()}
+        for kind, places in about.places.items()
+        if places
+    }
+    if "room" in found:
+        found["room"] = senses.room_of(found["room"])
+    return found
 
 
 # ------------------------------------------------------------------ one table
@@ -303,6 +315,10 @@ FILES: dict[str, _File] = {
         _kinds("name", "robot") | _kinds("measured", "azimuth", "elevation"), carried.angles
     ),
     "flow": _File(_kinds("measured", "vx", "vy"), carried.flow),
+    "compass": _File(_kinds("measured", "heading"), senses.compass),
+    "rssi": _File(_kinds("name", "to") | _kinds("measured", "strength"), senses.strengths),
+    "light": _File(_kinds("name", "lamp") | _kinds("measured", "intensity", *AXES), senses.light),
+    "ultrasonic": _File(_kinds("measured", *senses.BEAMS), senses.echoes),
     "magnetometer": _File(_kinds("number", *AXES), _magnetometer),
     "relative_pose": _File(
         _kinds("name", "robot") | _kinds("number", *AXES, *QUATERNION, "heading"), _poses
@@ -311,7 +327,7 @@ FILES: dict[str, _File] = {
 ORDER = (
     "imu", "odometry", "landmark_bearings", "uav_bearings", "landmark_vectors", "uav_vectors",
     "uav_ranges", "anchor_ranges", "tdoa", "arrival_angles", "height", "position_fix", "flow",
-    "magnetometer", "relative_poses",
+    "compass", "rssi", "uav_rssi", "light", "ultrasonic", "magnetometer", "relative_poses",
 )  # fmt: skip
 
 
@@ -327,6 +343,10 @@ def stream_files(recording: Recording) -> dict[str, tuple[str, ...]]:
         "tdoa": ("tdoa",),
         "angles": ("arrival_angles",),
         "flow": ("flow",),
+        "compass": ("compass",),
+        "rssi": ("rssi", "uav_rssi"),
+        "light": ("light",),
+        "ultrasonic": ("ultrasonic",),
         "magnetometer": ("magnetometer",),
         "relative_pose": ("relative_poses",),
     }

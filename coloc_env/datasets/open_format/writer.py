@@ -63,6 +63,10 @@ def _description(recording: Recording) -> dict[str, Any]:
         "landmarks": dict(zip(recording.landmark_names, recording.landmarks.tolist(), strict=True)),
         "anchors": dict(zip(recording.anchor_names, recording.anchors.tolist(), strict=True)),
     }
+    places |= {
+        kind: {name: place.tolist() for name, place in found.items()}
+        for kind, found in recording.places.items()
+    }
     about["map"] = {kind: found for kind, found in places.items() if found}
     if recording.tags.shape[1]:
         about["tags"] = {
@@ -133,10 +137,13 @@ def _columns(recording: Recording, stream: str, table: Table) -> dict[str, Colum
         if name == "anchor":
             found["to"] = _named(recording.anchor_names, values)
         elif name == "robot":
-            title = "to" if stream == "uav_ranges" else "robot"
+            title = "to" if stream in ("uav_ranges", "uav_rssi") else "robot"
             found[title] = _named(recording.robots, values)
         elif name in ("from", "to"):
             found[name] = _named(recording.anchor_names, values)
+        elif name in ("point", "lamp"):
+            title, kind = ("to", "access_points") if name == "point" else ("lamp", "lamps")
+            found[title] = _named(tuple(recording.places[kind]), values)
         elif name == "landmark":
             found["landmark"] = _named(recording.landmark_names, values)
         elif name in _SHOWN:

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from coloc_env.motion import Box
-from coloc_env.options import Count, Group, Metres, PositiveMetres, Share
+from coloc_env.options import Count, Group, Metres, PositiveMetres, Seconds, Share
 from coloc_env.sensors import AnchorRanging, RangeNoise, Rssi, RssiOptions, Tdoa, UavRssi
-from coloc_env.sensors.ranging import Tags
+from coloc_env.sensors.ranging import AnchorOffset, Tags
 
 _SPOTS = (
     (0.0, 0.0),
@@ -23,18 +23,24 @@ _SPOTS = (
 @dataclass(frozen=True)
 class AnchorOptions(Group):
     """So many ``anchors``, at known places in the room's corners, then along its walls, measure
-    their distances to all UAVs. Every range to number ``nlos_anchor`` has the bias of NLOS."""
+    their distances to all UAVs. Every range to number ``nlos_anchor`` has the bias of NLOS. All
+    ranges to the first ``biased_anchors`` are ``anchor_bias`` m too long, which nobody believes; it
+    grows linearly from 0 over the first ``anchor_bias_rise`` s."""
 
     title: ClassVar[str] = "anchors"
 
     anchors: Count = 0
     nlos_anchor: Count | None = None
+    biased_anchors: Count = 0
+    anchor_bias: Metres = 1.0
+    anchor_bias_rise: Seconds = 0.0
 
     def true(self, room: tuple[float, ...], noise: RangeNoise, tags: Tags = ()) -> AnchorRanging:
         """The sensor as it is, in a room with sides in m, to tags with lever arms."""
         blocked = () if self.nlos_anchor is None else (self.nlos_anchor,)
         places = anchor_places("anchors", self.anchors, room)
-        return AnchorRanging(places, noise, tags, blocked=blocked)
+        offset = AnchorOffset(self.biased_anchors, self.anchor_bias, self.anchor_bias_rise)
+        return AnchorRanging(places, noise, tags, blocked=blocked, offset=offset)
 
     def believed(
         self, room: tuple[float, ...], noise: RangeNoise, tags: Tags = ()

@@ -160,7 +160,7 @@ def test_names_are_those_of_the_map() -> None:
         assert same.float().mean() > 0.95
 
 
-@pytest.mark.parametrize("agent", ["ukf", "ekf_joint", "dfgo", "ekf:fusion=exchange"])
+@pytest.mark.parametrize("agent", ["ekf_joint", "dlspf", "slam", "ekf:fusion=exchange"])
 def test_who_needs_names_refuses(agent: str) -> None:
     with pytest.raises(NotServed, match=r"would be ignored|needs landmarks with names"):
         make(agent, make_scenario("indoor-v0", **UNNAMED))

@@ -17,6 +17,7 @@ from coloc_env.network import Network
 from coloc_env.scenario import ConstantVelocity, Prior, Scenario
 from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import PositionFix
+from coloc_env.world import World
 
 W, E = 5, 4
 
@@ -227,3 +228,25 @@ def test_bad_options_are_refused_in_a_line(text: str) -> None:
     with pytest.raises(ValueError, match=text.split("=")[0]) as error:
         make(f"dfgo:{text}", make_scenario("indoor-v0"))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["dfgo:window=4", "dfgo_central:window=3", "ukf"])
+def test_names_that_are_found_rightly_are_as_good_as_given(name: str) -> None:
+    """The same noise, in another order: with a narrow prior the estimates are the very same."""
+
+    def estimates(association: str) -> Tensor:
+        scenario = make_scenario(
+            "indoor-v0", association=association, n_uavs=2, landmarks=6, prior_std=0.05
+        )
+        world, localizer = World(scenario), make(name, scenario)
+        seen = world.reset([4])
+        belief: Any = localizer.reset(seen)
+        found = []
+        for _ in range(6):
+            belief, estimate = localizer.step(belief, seen)
+            found.append(estimate.position)
+            world.advance(estimate.action())
+            seen = world.observation()
+        return torch.stack(found)
+
+    torch.testing.assert_close(estimates("unknown"), estimates("known"), rtol=0, atol=1e-9)

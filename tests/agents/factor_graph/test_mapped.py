@@ -161,8 +161,8 @@ def test_a_first_step_is_scipys_least_squares(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["dfgo", "dfgo_central"])
 def test_with_the_map_it_is_the_smoother_that_is_given_it(name: str) -> None:
-    overrides: dict[str, Any] = {"anchors": 2, "n_uavs": 3, "prior_std": 0.3, "landmarks": 6}
-    name = f"{name}:window=6"
+    overrides: dict[str, Any] = {"anchors": 2, "n_uavs": 2, "prior_std": 0.3, "landmarks": 6}
+    name = f"{name}:window=4"
 
     def errors(known: bool) -> Tensor:
         scenario = make_scenario("indoor-v0", landmarks_known=known, **overrides)
@@ -178,7 +178,7 @@ def test_with_the_map_it_is_the_smoother_that_is_given_it(name: str) -> None:
                 found=torch.ones_like(belief.found),
             )
         found = []
-        for _ in range(12):
+        for _ in range(8):
             belief, estimate = localizer.step(belief, seen)
             found.append(estimate.position - world.truth.position)
             world.advance(estimate.action())

@@ -257,6 +257,7 @@ def lied_to(localizer: Any, far: float, which: slice, seeds: list[int], tools: A
     return errors(localizer, scenario, run, seeds)
 
 
+@pytest.mark.slow
 def test_all_landmarks_may_be_far_off_for_a_step(tools: SimpleNamespace) -> None:
     """Over 9 worlds the lie costs 0.4 m in the mean; after 47 honest steps 0.07 m are left at most,
     as without it."""

@@ -13,6 +13,7 @@ from agents.stein.cspf import SteinFilter
 from coloc_env.observation import Observation
 from coloc_env.scenarios import make_scenario
 from coloc_env.world import World
+from tests.sampling import slowly
 from training.evaluation.team import team_figures
 
 STRANGER = 1
@@ -37,17 +38,20 @@ def converged(name: str, agent: str, seeds: int, steps: int, **overrides: Any) -
     ("name", "agent", "steps"),
     [
         ("stein2d-v0", "cspf", 90),
-        ("stein2d-v0", "cspf:particles=1", 90),
-        ("stein3d-v0", "cspf:particles=20", 70),
-        ("stein2d-v0", "pf_joint:anneal=0.96", 130),
         ("stein2d-v0", "pose_graph:every=60", 60),
-        ("stein3d-v0", "pose_graph:robust=gnc:every=40", 40),
+        *slowly(
+            ("stein2d-v0", "cspf:particles=1", 90),
+            ("stein3d-v0", "cspf:particles=20", 70),
+            ("stein2d-v0", "pf_joint:anneal=0.96", 130),
+            ("stein3d-v0", "pose_graph:robust=gnc:every=40", 40),
+        ),
     ],
 )
 def test_teams_find_each_other(name: str, agent: str, steps: int) -> None:
     assert converged(name, agent, 6, steps).sum() >= 5
 
 
+@pytest.mark.slow
 def test_ten_share_the_penalty_and_find_each_other() -> None:
     ten = {"n_uavs": 10, "matches_per_step": 3}
     assert converged("stein2d-v0", "cspf:particles=1", 6, 100, **ten).sum() >= 5
@@ -122,6 +126,7 @@ def test_nan_harms_nobody_else(tools: SimpleNamespace) -> None:
     torch.testing.assert_close(moved.position[:, 1], run.position[:, 1], rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_a_uav_that_was_not_heard_is_caught_up_with() -> None:
     """Links that come and go: holders learn later what others did meanwhile."""
     lossy = {"message_loss": 0.3, "outliers": 0.1}

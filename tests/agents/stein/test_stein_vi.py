@@ -230,6 +230,7 @@ def test_false_matches_hurt_no_more_than_without() -> None:
     assert 0.8 < belief.inliers.mean() <= 1
 
 
+@pytest.mark.slow
 def test_half_of_the_matches_wrong() -> None:
     made = euroc(span=(0.0, 10.0), false_matches=0.5, prior_std=0.5)
     ours, _, belief = localized(made, "stein_vi:outliers=0.5")

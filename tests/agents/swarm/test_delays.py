@@ -131,6 +131,7 @@ def test_it_pays_where_clocks_are_off(overrides: dict[str, float], tools: Simple
     assert errors[0] < 0.7 * errors[1]
 
 
+@pytest.mark.slow
 def test_delays_of_anchors_are_estimated() -> None:
     scenario = make_scenario("campus-v0", flight="s1", clock_skew=0.0)
     localizer, world = make("map", scenario), World(scenario, 2)

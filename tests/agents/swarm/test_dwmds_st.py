@@ -58,6 +58,7 @@ def test_the_calibrated_ones_are_near_the_bound(results: Any) -> None:
     assert error(results, "dwmds_st") < 1.5 * bound
 
 
+@pytest.mark.slow
 def test_the_first_step_tells_good_ranges_from_bad() -> None:
     """Half of all ranges with 50 m of noise, a start that is 90 m off: within the bound's reach."""
     overrides = {"n_uavs": 100, "nlos": 0.0, "uwb_tail": 0.5, "horizon": 2}
@@ -163,6 +164,7 @@ def test_the_ins_bias_is_taken_off() -> None:
     assert with_bias < 0.9 * without
 
 
+@pytest.mark.slow
 def test_persistent_nlos_is_recognized(monkeypatch: pytest.MonkeyPatch) -> None:
     world: dict[str, Any] = {"n_uavs": 80, "nlos": 0.5, "horizon": 30}
     lasting, fresh = (run("dwmds_st", **world, nlos_time=time) for time in (10.0, None))

@@ -447,7 +447,7 @@ def test_a_range_that_went_around_is_not_trusted_and_honest_ones_are(
     crossed(
         [("ekf_trust", "ekf"), ("pf_trust", "apf")],
         [({"nlos": 0.3}, 0.8), ({"false_matches": 0.1}, 0.3)],
-        every=2,
+        every=4,
     ),
     ids=str,
 )

@@ -342,6 +342,26 @@ def test_pairs_are_differences_one_by_one(poses: type[Poses], dtype: torch.dtype
 
 
 @both
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_pulls_are_sums_of_differences(poses: type[Poses], dtype: torch.dtype) -> None:
+    g = torch.Generator().manual_seed(4)
+    x, y = (
+        poses.exp(2 * torch.randn(2, n, poses.dof, generator=g, dtype=torch.float64)).to(dtype)
+        for n in (5, 7)
+    )
+    y[:, :2] = x[:, :2]
+    w = torch.rand(2, 7, generator=g, dtype=torch.float64).to(dtype)
+    found = poses.pulls(x, y, w)
+    for m in range(5):
+        tangent = torch.stack([poses.minus(y[:, n], x[:, m]) for n in range(7)], 1)
+        position, turn = tangent[..., : poses.dim], tangent[..., poses.dim :]
+        tolerance = 300 * torch.finfo(dtype).eps
+        close(found.tangent[:, m], (w.unsqueeze(-1) * tangent).sum(1), tolerance)
+        close(found.position[:, m], (w * position.square().sum(-1)).sum(1), 10 * tolerance)
+        close(found.turn[:, m], (w * turn.square().sum(-1)).sum(1), tolerance)
+
+
+@both
 def test_pair_differences_are_the_gradient_of_the_distances(poses: type[Poses]) -> None:
     g = torch.Generator().manual_seed(4)
     x, y = (poses.exp(torch.randn(6, poses.dof, generator=g, dtype=torch.float64)) for _ in "xy")

@@ -147,7 +147,7 @@ def test_the_x_axis_leads_along_the_horizontal_velocity(name, dim, fly, arena):
 
 
 def inside(truth, room, slack=1e-9):
-    low, high = torch.tensor(room.low), torch.tensor(room.high)
+    low, high = (torch.tensor(end, dtype=torch.float64) for end in (room.low, room.high))
     return bool(((truth.position >= low - slack) & (truth.position <= high + slack)).all())
 
 

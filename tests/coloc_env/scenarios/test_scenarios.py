@@ -20,9 +20,9 @@ from coloc_env.world import World
     ("overrides", "words"),
     [
         ({"n_uav": 3}, r"unknown option 'n_uav' \(did you mean 'n_uavs'\?\); known: room, dt"),
-        ({"n_uavs": 2.5}, "n_uavs=2.5 is not allowed: a whole number ≥ 1 is needed"),
-        ({"n_uavs": True}, "n_uavs=True is not allowed: a whole number ≥ 1 is needed"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"n_uavs": 2.5}, "n_uavs=2.5 is not allowed: a whole number from 1 to 10000 is needed"),
+        ({"n_uavs": True}, "n_uavs=True is not allowed: a whole number from 1 to 10000 is needed"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number from 1 to 10000"),
         ({"nlos": 1.5}, "nlos=1.5 is not allowed: a number from 0 to 1 is needed"),
         ({"nlos": float("nan")}, "nlos=nan is not allowed: a number from 0 to 1 is needed"),
         ({"uwb_std": -0.1}, "uwb_std=-0.1 is not allowed: a number ≥ 0 in m is needed"),

@@ -239,7 +239,7 @@ def test_the_bound_is_that_of_those_who_are_scored() -> None:
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number from 1 to 10000"),
         ({"dt": 0.0}, "dt=0.0 is not allowed: a number > 0 in s"),
         ({"size": (1e3, 1e3, 0.0)}, "size=.* is not allowed: 3 numbers > 0 in m"),
         ({"size": (1e3, 1e3)}, "size=.* is not allowed: 3 numbers"),

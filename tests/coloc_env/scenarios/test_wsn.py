@@ -142,6 +142,17 @@ def test_every_range_to_the_nlos_anchor_is_long_and_no_other(kind: str) -> None:
         assert float(own.std()) == pytest.approx(0.8, rel=8 / len(own) ** 0.5)
 
 
+@pytest.mark.parametrize("rise", [0.0, 20.0])
+def test_ranges_to_the_biased_anchors_grow_too_long_and_no_others(rise: float) -> None:
+    error, _ = errors(biased_anchors=2, anchor_bias=0.8, anchor_bias_rise=rise)
+    late = error - errors()[0]
+    assert not late[..., 2:].any()
+    steps = torch.arange(len(late)) * 0.1
+    share = (steps / rise).clamp_max(1.0) if rise else torch.ones_like(steps)
+    expected = (0.8 * share).double().view(-1, 1, 1, 1).expand_as(late[..., :2])
+    torch.testing.assert_close(late[..., :2], expected, atol=1e-5, rtol=0)
+
+
 def test_some_ranges_to_all_anchors_are_long() -> None:
     late = errors(nlos=0.3, nlos_kind="constant")[0] - errors()[0]
     share = (late > 0.5).double().flatten(0, 2).mean(0)
@@ -237,13 +248,14 @@ def test_everyone_is_carried_across_the_room() -> None:
         ({"case": "2"}, "case='2' is not allowed: one of 1, 2, 3"),
         ({"anchors": 0}, "anchors=0 is not allowed: 1 to 8"),
         ({"anchors": 9}, "anchors=9 is not allowed: 1 to 8"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number from 1 to 10000"),
         ({"horizon": 0}, "horizon=0 is not allowed: a whole number ≥ 1"),
         ({"uwb_std": -0.1}, "uwb_std=-0.1 is not allowed: a number ≥ 0 in m is needed"),
         ({"believed_uwb_std": 0.0}, "believed_uwb_std=0.0 is not allowed: a number > 0 in m or"),
         ({"q": -1.0}, "q=-1.0 is not allowed: a number ≥ 0 in m²/s⁴ or none is needed"),
         ({"nlos_anchor": 4}, r"blocked=\(4,\) is not allowed: indices of the 4 anchors"),
         ({"nlos_anchor": 2, "anchors": 2}, "indices of the 2 anchors"),
+        ({"biased_anchors": 5}, "offset=.* is not allowed: of at most 4 anchors"),
         ({"nlos_anchor": -1}, "nlos_anchor=-1 is not allowed: a whole number ≥ 0 or none"),
         ({"nlos_kind": "odd"}, "nlos_kind='odd' is not allowed: one of exponential, constant"),
         ({"nlos": 1.5}, "nlos=1.5 is not allowed: a number from 0 to 1"),

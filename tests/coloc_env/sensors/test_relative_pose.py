@@ -164,7 +164,7 @@ def test_one_uav_alone_meets_nobody() -> None:
         ({"motion": "hover"}, "motion='hover' is not allowed: one of static, circle"),
         ({"motion": "static", "n_uavs": 10}, "motion=static is not allowed: only for at most 9"),
         ({"dt": 0.0}, "dt=0.0 is not allowed: a number > 0 in s"),
-        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number ≥ 1"),
+        ({"n_uavs": 0}, "n_uavs=0 is not allowed: a whole number from 1 to 10000"),
     ],
 )
 def test_wrong_overrides_are_named(overrides: dict[str, Any], words: str) -> None:

@@ -20,6 +20,7 @@ from training.cli.render import _pace
 from training.cli.terminal import progress
 from training.evaluation.evaluate import split_agents
 from training.evaluation.files import FIGURES, VECTORS, WRITTEN
+from training.reproduce.study import STUDIES
 
 SMALL = ["--set", "n_uavs=2", "--set", "horizon=12"]
 CHECKOUT = Path(__file__).parents[3]
@@ -380,3 +381,10 @@ def test_ctrl_c_in_a_real_process(tmp_path: Path) -> None:
         process.kill()
     assert (process.returncode, errors) == (130, b"interrupted\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_reproduces_help_names_every_part() -> None:
+    text = coloc("reproduce", "--help").stdout
+    for key in STUDIES:
+        for part in STUDIES[key]().parts:
+            assert part in text, (key, part)

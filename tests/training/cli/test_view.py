@@ -23,6 +23,9 @@ def test_a_scenario_is_written(tmp_path: Path) -> None:
         (("indoor-v0", "--steps", "0"), "--steps 0 is not allowed: 1 to 1000"),
         (("indoor-v0", "--out", "x.png"), "--out x.png is not allowed: a name ending in .rrd"),
         (("{empty}",), "results.json"),
+        (("{empty}", "--agent", "ekf"), "--agent is for a scenario"),
+        (("{empty}", "--set", "nlos=0.1"), "--set is for a scenario"),
+        (("{empty}", "--seed", "0"), "--seed is for a scenario"),
     ],
 )
 def test_bad_words_are_refused(tmp_path: Path, words: tuple[str, ...], message: str) -> None:

@@ -4,18 +4,21 @@ import copy
 import dataclasses
 import json
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from agents import Estimate, make
 from coloc_env.bounds import posterior_bound
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
 from training.evaluation import metrics
 from training.evaluation.evaluate import evaluate
 from training.evaluation.results import Evaluation
+from training.evaluation.rollout import rollout
 
 FIGURES = [
     "rmse",
@@ -224,6 +227,7 @@ def test_progress() -> None:
         ({"agents": ["ekff"]}, "did you mean 'ekf'"),
         ({"agents": ["ekf:robust=maybe"]}, "robust='maybe' is not allowed"),
         ({"runs": 0}, "runs=0"),
+        ({"runs": 10**11}, "runs=100000000000 is not allowed: 1 to 10000000"),
         ({"seed": -1}, "seed=-1"),
         ({"chunk": 0}, "chunk=0"),
     ],
@@ -231,3 +235,29 @@ def test_progress() -> None:
 def test_clear_words(wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         evaluate(scenario(), **{"agents": ["test_still"], "runs": 1} | wrong)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda one: one.position, "step must return a belief and an Estimate, not Tensor"),
+        (
+            lambda one: one.replace(position=one.position[..., :2]),
+            r"an estimate's position must be \[2, 3, 3\], not \[2, 3, 2\]",
+        ),
+        (
+            lambda one: one.replace(covariance=one.covariance.diagonal(dim1=-2, dim2=-1)),
+            r"an estimate's covariance must be \[2, 3, 3, 3\], not \[2, 3, 3\]",
+        ),
+    ],
+)
+def test_estimates_of_a_wrong_shape_are_named(
+    spoil: Callable[[Estimate], Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    localizer = make("test_still", scenario())
+    right = localizer.step
+    monkeypatch.setattr(
+        localizer, "step", lambda *given: (right(*given)[0], spoil(right(*given)[1]))
+    )
+    with pytest.raises(ValueError, match=words):
+        next(rollout(localizer, scenario(), torch.arange(2)))

@@ -3,6 +3,7 @@
 import html
 import json
 import re
+import shlex
 import shutil
 import subprocess
 
@@ -93,6 +94,8 @@ def test_the_command_repeats_the_evaluation(evaluation) -> None:
         "coloc evaluate indoor-v0 --agents dead_reckoning,ekf --runs 2 --seed 5 "
         "--set horizon=40 --set nlos=0.1 --set landmarks=8 --out x"
     )
+    odd = "a b; <c>"  # as a shell reads it
+    assert shlex.split(command(runs.of(evaluation, odd)))[-2:] == ["--out", odd]
 
 
 def test_two_of_one_name_are_refused(evaluation) -> None:

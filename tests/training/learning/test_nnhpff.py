@@ -226,6 +226,7 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights(unbroken: Path, tmp_path: Path) -> None:
     runs.start("nnhpff", SMALL, tmp_path / "same", quiet)
     assert outcome(tmp_path / "same") == outcome(unbroken)

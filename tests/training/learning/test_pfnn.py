@@ -116,6 +116,7 @@ def column(folder: Path, name: str) -> list[float]:
         return [float(value) for _, value in csv.reader(file)]
 
 
+@pytest.mark.slow
 def test_offline_learns(tmp_path: Path) -> None:
     options = {"scenario": SCENARIO, "worlds": 2, "epochs": 5, "minibatch": 32, "score_runs": 0}
     runs.start("pfnn", options, tmp_path / "run", quiet)

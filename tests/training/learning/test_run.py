@@ -50,6 +50,7 @@ def unbroken(mode: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, b
     return outcome(folder)
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights(mode: str, unbroken: dict[str, bytes], tmp_path: Path) -> None:
     runs.start("pfnn", {"mode": mode} | SMALL, tmp_path / "same", quiet)
     assert outcome(tmp_path / "same") == unbroken

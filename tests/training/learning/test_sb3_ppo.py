@@ -117,6 +117,7 @@ def test_every_layer_moves(
     assert (bias[3:] != float(np.log(0.3))).all(), "the log-std is learned, too"
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights(
     options: dict[str, Any], unbroken: dict[str, bytes], tmp_path: Path
 ) -> None:
@@ -166,6 +167,7 @@ def test_every_epoch_flies_worlds_of_its_own_to_their_horizon() -> None:
     assert all(0 < value < 5 for _, value in logged)
 
 
+@pytest.mark.slow
 def test_it_learns_to_localize(tmp_path: Path) -> None:
     """From nothing but the landmarks: a few thousand steps cut the error to a third."""
     longer = SMALL | {"scenario": SCENARIO.replace("10", "40"), "base": "none"}

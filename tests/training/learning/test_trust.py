@@ -245,6 +245,7 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return outcome(folder)
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights(unbroken: dict[str, bytes], tmp_path: Path) -> None:
     runs.start("trust", SMALL, tmp_path / "same", quiet)
     assert outcome(tmp_path / "same") == unbroken

@@ -1,6 +1,7 @@
 """``coloc reproduce cspf``: measures and verdicts on made-up runs, and a small page."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from made import Made, runs_of
 
 from coloc_env.scenarios import make_scenario
-from training.reproduce.cspf import cspf, plan
+from training.reproduce.cspf import clouds, cspf, plan
 from training.reproduce.cspf.claims import claims, real
 from training.reproduce.cspf.plan import converged, converged_over_time, late_nees, worst
 from training.reproduce.results import Runs
@@ -47,6 +48,22 @@ def test_measures() -> None:
     assert most[3] == np.inf
     np.testing.assert_allclose(np.delete(most, 3), 0.2, rtol=1e-6)
     assert late_nees(runs) == 2.0
+
+
+def test_clouds_are_of_one_run_beside_its_truth() -> None:
+    runs = {"cspf": SimpleNamespace(steps=14)}
+    results: Any = SimpleNamespace(settings=SimpleNamespace(seed=0), runs=lambda key, agents: runs)
+    found = clouds.clouds(results, 2)
+    assert found is not None
+    assert found.particles.shape == (14, 3, 50, 2)
+    assert not found.truth[:, 0].any()
+    assert not found.particles[:, 0].any()
+    spread = found.particles[:, 1:].std(2).mean((1, 2))
+    assert spread[-1] < 0.5 * spread[0]
+    assert found.wrong.nonzero().flatten().tolist() == [13]
+    runs.clear()
+    assert clouds.clouds(results, 2) is None
+    assert clouds.plane(results) is clouds.coordinates(results) is clouds.space(results) is None
 
 
 def found(good: bool) -> Made:

@@ -12,7 +12,7 @@ from sklearn import metrics
 from agents import make
 from coloc_env.scenarios import make_scenario
 from training.reproduce.measures import mean_error
-from training.reproduce.nnhpff import detection, nnhpff, noise, plan
+from training.reproduce.nnhpff import bias, detection, nnhpff, noise, plan
 from training.reproduce.nnhpff.claims import claims
 from training.reproduce.nnhpff.plan import (
     HELD,
@@ -279,6 +279,27 @@ def test_what_detectors_see_is_recorded() -> None:
     assert found.features.shape == (2, 5, 5)
     squared = (found.features[..., 1:] ** 2).mean(-1)
     np.testing.assert_allclose(found.rms**2, squared, rtol=1e-4)
+
+
+def test_areas_apart_by_worlds() -> None:
+    """A score that knows more than one that guesses, and two that order alike."""
+    rng = np.random.default_rng(0)
+    failed = rng.random((10, 80)) < 0.3
+    knows, guesses = failed + rng.normal(0, 0.5, failed.shape), rng.random(failed.shape)
+    found = bias.areas_apart(knows, guesses, failed)
+    areas = [metrics.roc_auc_score(failed.ravel(), x.ravel()) for x in (knows, guesses)]
+    assert found.mean == pytest.approx(areas[0] - areas[1])
+    assert 0.2 < found.low < found.mean < found.high < 0.6
+    same = bias.areas_apart(knows, 3 * knows + 1, failed)
+    assert (same.mean, same.low, same.high) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_what_is_biased_is_run_and_told_apart(tmp_path: Path) -> None:
+    where = bias.variants()[1].key
+    reproduce(nnhpff(), Settings(tmp_path, 2, variants=[where], steps=15, part="bias"))
+    text = (tmp_path / "page.md").read_text()
+    assert text.count("| case=3, biased_anchors=2, anchor_bias=1 |") == 2
 
 
 def test_figure_4_is_trained_with_the_whole_study_only(tmp_path: Path) -> None:

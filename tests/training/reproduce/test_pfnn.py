@@ -407,7 +407,7 @@ def test_figures_2_to_8(monkeypatch: pytest.MonkeyPatch) -> None:
         (["--seed", "-1"], "--seed -1"),
         (
             ["--part", "campus"],
-            "pfnn has no part 'campus': paper, robustness, rivals, regimes, all are allowed",
+            "pfnn has no part 'campus': paper, robustness, rivals, regimes, corrector, all are",
         ),
         (["--report-only"], "holds nothing yet: run without --report-only first"),
         (["--page", "x.md"], "results.json does not exist: run the study first"),

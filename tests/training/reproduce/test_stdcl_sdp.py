@@ -22,6 +22,7 @@ def test_exact_ranges_give_the_positions() -> None:
     assert gap < 1e-3
 
 
+@pytest.mark.slow
 def test_gauss_newton_finds_the_same_from_both_starts() -> None:
     """With everybody in reach the minimum near dead reckoning is the one that the program finds."""
     torch.set_num_threads(1)

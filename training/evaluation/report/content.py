@@ -1,6 +1,7 @@
 """What a report shows, as plain data: tables, curves, the player's frames, the worst moments."""
 
 import base64
+import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,14 +85,13 @@ def _settings(runs: Runs) -> dict[str, str]:
 
 
 def command(runs: Runs) -> str:
-    """What repeats the evaluation."""
+    """What repeats the evaluation, as a shell reads it."""
     summary = runs.summary
-    overrides = summary.get("overrides") or {}
-    settings = "".join(f" --set {key}={typed(value)}" for key, value in overrides.items())
-    return (
-        f"coloc evaluate {summary['scenario']} --agents {','.join(summary['agents'])}"
-        f" --runs {summary['runs']} --seed {summary['seed']}{settings} --out {runs.name}"
-    )
+    words = ["coloc", "evaluate", summary["scenario"], "--agents", ",".join(summary["agents"])]
+    words += ["--runs", str(summary["runs"]), "--seed", str(summary["seed"])]
+    for key, value in (summary.get("overrides") or {}).items():
+        words += ["--set", f"{key}={typed(value)}"]
+    return shlex.join([*words, "--out", runs.name])
 
 
 def _curves(runs: Runs, one: Method, thin: int) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """CSPF: the claims of the collaborative Stein particle filter, outliers, and what lies beyond."""
 
-from training.reproduce.cspf import claims, plan, report
+from training.reproduce.cspf import claims, clouds, plan, report
 from training.reproduce.study import Part, Study
 
 
@@ -13,7 +13,7 @@ def cspf() -> Study:
         report.text,
         claims.claims,
         tables=report.paper_tables,
-        figures=report.FIGURES,
+        figures=report.FIGURES | clouds.FIGURES,
     )
     beyond = Part("Beyond the paper", plan.beyond, tables=report.beyond_tables)
     real = Part("Recordings", plan.real, claims=claims.real, tables=report.real_tables)

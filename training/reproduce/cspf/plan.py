@@ -78,6 +78,7 @@ def beyond(settings: Settings) -> Iterator[Cell]:
     yield Cell(published, agents, settings.fraction(10), key=CLOUDS)
     for variant in teams(settings.steps):
         yield Cell(variant, METHODS, settings.fraction(_divisor(variant)))
+    yield Cell(moving(settings.steps), METHODS, settings.fraction(5))
     for variant in hard(settings.steps):
         yield Cell(variant, (*METHODS, *CENTRAL), settings.fraction(_divisor(variant)))
 
@@ -100,6 +101,11 @@ def hard(steps: int | None) -> list[Variant]:
         {"outliers": 0.4, "message_loss": 0.5},
     )
     return [world(2, steps, **each) for each in worlds]
+
+
+def moving(steps: int | None) -> Variant:
+    """UAVs that move in space, with the odometry of those in the plane."""
+    return world(3, steps, motion="random", odometry_noise=(0.005, 0.2))
 
 
 def _divisor(variant: Variant) -> int:

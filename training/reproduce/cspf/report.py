@@ -45,6 +45,7 @@ def beyond_tables(results: Results) -> Iterator[Table]:
     yield _table("Particles, and eq. 16", _places(results, [plan.CLOUDS], agents))
     teams, hard = ([v.key for v in some] for some in (plan.teams(None), plan.hard(None)))
     yield _table("Larger teams", _places(results, teams, plan.METHODS))
+    yield _table("Moving in space", _places(results, [plan.moving(None).key], plan.METHODS))
     methods = (*plan.METHODS, *plan.CENTRAL)
     yield _table("Where many modes persist", _places(results, hard, methods))
 

@@ -1,6 +1,6 @@
 """NN-HPFF: its figures 4 to 8 and table 1, its detector in detail, and a study beyond."""
 
-from training.reproduce.nnhpff import claims, figures, noise, plan, tables
+from training.reproduce.nnhpff import bias, claims, figures, noise, plan, tables
 from training.reproduce.study import Part, Study
 
 
@@ -22,5 +22,12 @@ def nnhpff() -> Study:
     )  # fmt: skip
     beyond = Part("Beyond the paper", plan.beyond, tables=tables.beyond, figures=figures.BEYOND)
     several = Part("Several true σ", noise.cells, noise.text, tables=noise.tables)
-    parts = {"paper": own, "detector": detector, "noise": several, "robustness": beyond}
+    alike = Part("Where a network might win", bias.cells, bias.text, tables=bias.tables)
+    parts = {
+        "paper": own,
+        "detector": detector,
+        "noise": several,
+        "bias": alike,
+        "robustness": beyond,
+    }
     return Study("nnhpff", "NN-HPFF", plan.TITLE, 100, parts)

@@ -98,7 +98,7 @@ def case(number: int, steps: int | None = None, **overrides: float) -> Variant:
 def trained_on(steps: int | None = None) -> list[Planned]:
     """The detector's training scenarios, each with its main filter; in worlds of other seeds."""
     return [
-        (_variant("trained", text, steps), (_open_loop(main),))
+        (variant_of("trained", text, steps), (open_loop(main),))
         for text, main in product(VARIANTS.split("/"), MAINS.split("/"))
     ]
 
@@ -117,7 +117,7 @@ def never_seen(steps: int | None = None) -> list[Planned]:
     )
     mains = ("pf:particles=1000", "pf:particles=5000")
     return [
-        (_variant("unseen", text, steps), (_open_loop(main),))
+        (variant_of("unseen", text, steps), (open_loop(main),))
         for text, main in product(texts, mains)
     ]
 
@@ -223,12 +223,12 @@ def kidnapped_uavs(variant: Variant) -> slice:
     return slice(0, len(dict(variant.overrides).get("kidnapped", (0,))))
 
 
-def _open_loop(main: str) -> str:
+def open_loop(main: str) -> str:
     """A filter that is watched by the network and never restarted."""
     return f"nnhpff:bank=false:main={main.replace(':', '@')}:threshold=1"
 
 
-def _variant(kind: str, text: str, steps: int | None) -> Variant:
+def variant_of(kind: str, text: str, steps: int | None) -> Variant:
     """A variant of wsn-v0 from overrides as on a command line."""
     overrides = tuple(parse_overrides("wsn-v0", text.split(":")).items())
     return Variant(

@@ -2,6 +2,7 @@
 
 from training.reproduce.pfnn import (
     claims,
+    corrector,
     figures,
     paper,
     plan,
@@ -39,5 +40,14 @@ def pfnn() -> Study:
         trainings=regimes.trainings,
     )
     more = Part("More rivals", rivals.cells, rivals.text, tables=rivals.tables)
-    parts = {"paper": own, "robustness": beyond, "rivals": more, "regimes": where}
+    sees = Part(
+        "A corrector that sees residuals", corrector.cells, corrector.text, tables=corrector.tables
+    )
+    parts = {
+        "paper": own,
+        "robustness": beyond,
+        "rivals": more,
+        "regimes": where,
+        "corrector": sees,
+    }
     return Study("pfnn", "PF-NN", paper.TITLE, paper.RUNS, parts)

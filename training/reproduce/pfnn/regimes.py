@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from training.evaluation import metrics
-from training.evaluation.metrics import Difference, Floats
+from training.evaluation.metrics import Floats
 from training.evaluation.tables import short
 from training.reproduce.measures import rmse
 from training.reproduce.pfnn.plan import ORACLE
 from training.reproduce.results import Results
 from training.reproduce.settings import Settings
-from training.reproduce.tables import DASH, Table, signed
-from training.reproduce.verdicts import gain
+from training.reproduce.tables import Table
+from training.reproduce.verdicts import apart
 from training.reproduce.work import WORLD, Cell, Training, Variant
 
 STEPS = 300  # of a run, and of a training episode, unless a study is cut shorter
@@ -112,8 +112,8 @@ def tables(results: Results) -> Iterator[Table]:
         plain, ours = each[PLAIN], each.get(trained(variant, out))
         blind, kalman = each.get(UNTRAINED), each.get(KALMAN)
         known = _oracle(results, variant.key)
-        cells = [_apart(one, plain) for one in (ours, blind, known, kalman)]
-        cells += [_apart(ours, blind), _apart(ours, kalman)]
+        cells = [apart(one, plain) for one in (ours, blind, known, kalman)]
+        cells += [apart(ours, blind), apart(ours, kalman)]
         rows.append([variant.title, short(float(np.sqrt(np.mean(plain**2)))), *cells])
     yield Table("Where the corrector works", header, rows)
 
@@ -124,11 +124,3 @@ def _oracle(results: Results, name: str) -> Floats | None:
     if found is None or world is None:
         return None
     return metrics.rmse_per_run(found.error, world.scored[: len(found.error)])
-
-
-def _apart(ours: Floats | None, other: Floats | None) -> str:
-    """How much larger an RMSE is than another's, in per cent of that."""
-    if ours is None or other is None:
-        return DASH
-    less = gain(ours, other)
-    return signed(Difference(*(0.0 - x for x in (less.mean, less.high, less.low))), "")

@@ -85,8 +85,8 @@ def test_who_spoils_others_calls_pays() -> None:
 @pytest.mark.parametrize("name", ["convoy-v0", "survey-v0", "relay-v0"])
 def test_scores_are_of_the_true_error_whatever_reward_trains(name: str) -> None:
     kept: dict[str, Any] = {"hold": 1, "difference": False, "network": "feedforward"}
-    believed = environment(make_task(f"{name}:reward=sigma", horizon=12), 4, 3, **kept)
-    true = environment(make_task(name, horizon=12), 4, 3, **kept)
+    believed = environment(make_task(f"{name}:reward=sigma", horizon=12), 4, 3, "cpu", **kept)
+    true = environment(make_task(name, horizon=12), 4, 3, "cpu", **kept)
     a, b = believed.reset(), true.reset()
     torch.manual_seed(0)
     apart = 0.0
@@ -104,8 +104,8 @@ def test_held_decisions_add_up() -> None:
     """One decision held for five steps is five steps of the same action."""
     task = make_task("convoy-v0", horizon=20)
     kept: dict[str, Any] = {"difference": False, "network": "feedforward"}
-    held = environment(task, 3, 5, hold=5, **kept)
-    single = environment(make_task("convoy-v0", horizon=20), 3, 5, hold=1, **kept)
+    held = environment(task, 3, 5, "cpu", hold=5, **kept)
+    single = environment(make_task("convoy-v0", horizon=20), 3, 5, "cpu", hold=1, **kept)
     a, b = held.reset(), single.reset()
     action = torch.tensor([1.0, 0.0]).expand(3, 4, 2)
     for _ in range(4):

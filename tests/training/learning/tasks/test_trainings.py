@@ -169,6 +169,7 @@ def test_scores_are_the_protocols(tmp_path: Path) -> None:
     assert card["scores"]["first_seed"] == FIRST_SEED
 
 
+@pytest.mark.slow
 def test_it_learns_the_survey_from_nothing(tmp_path: Path) -> None:
     options = {"task": "survey-v0:horizon=30", "worlds": 32, "epochs": 5, "score_worlds": 0}
     runs.start("task-mappo", options | {"learning_rate": 0.003}, tmp_path / "run", quiet)

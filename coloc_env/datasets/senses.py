@@ -1,0 +1,136 @@
+"""Recorded headings, signal strengths, lamps and distances to walls, as series by step."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from coloc_env.datasets.grid import Grid, last_on
+from coloc_env.datasets.noise_model import NoiseModel, StrengthModel
+from coloc_env.datasets.recording import Floats, Recording
+from coloc_env.datasets.replay import as_series, newest, once
+from coloc_env.sensors import (
+    Compass,
+    Light,
+    PathLoss,
+    RecordedSensor,
+    Rssi,
+    Sensor,
+    UavRssi,
+    Ultrasonic,
+)
+
+Read = Callable[[Recording, Grid, Any], RecordedSensor]
+_FAR = 1e4  # m: what was seen was near enough
+
+
+def believed_senses(recording: Recording, model: NoiseModel) -> dict[str, tuple[Read, Sensor]]:
+    """What reads each of these streams that the recording has, and the belief about its sensor."""
+    room = tuple(recording.places.get("room", {}).values())
+    own, echo = model.light, model.ultrasonic
+    made: dict[str, tuple[Read, Callable[[], Sensor]]] = {
+        "compass": (recorded_compass, lambda: Compass(model.compass.std)),
+        "rssi": (
+            recorded_strengths,
+            lambda: Rssi(_places(recording, "access_points"), _loss(model.rssi)),
+        ),
+        "uav_rssi": (recorded_uav_strengths, lambda: UavRssi(_loss(model.uav_rssi))),
+        "light": (
+            recorded_light,
+            lambda: Light(
+                _places(recording, "lamps"),
+                *(own.power, own.ambient, own.share, own.floor, own.angle_std),
+                radius=_FAR,
+            ),
+        ),
+        "ultrasonic": (
+            recorded_echoes,
+            lambda: Ultrasonic((_tuple(room[0]), _tuple(room[1])), echo.std, echo.reach, 0.0),
+        ),
+    }
+    return {
+        stream: (read, believed())
+        for stream, (read, believed) in made.items()
+        if stream in recording.streams
+    }
+
+
+def recorded_compass(recording: Recording, grid: Grid, sensor: Compass) -> RecordedSensor:
+    """Leaves ``compass`` and ``compass_mask``: the newest sample of each step."""
+    return newest(recording, grid, sensor, "compass")
+
+
+def recorded_strengths(recording: Recording, grid: Grid, sensor: Rssi) -> RecordedSensor:
+    """Leaves ``rssi``, ``rssi_mask`` and ``rssi_map``."""
+    values, there = _by_end(recording, grid, "rssi", len(sensor.points))
+    return RecordedSensor(
+        sensor,
+        {"rssi": as_series([v[..., 0] for v in values]), "rssi_mask": as_series(there)},
+        {"rssi_map": torch.tensor(sensor.points, dtype=torch.float32).flatten()},
+        _dropped(recording, "rssi"),
+    )
+
+
+def recorded_uav_strengths(recording: Recording, grid: Grid, sensor: UavRssi) -> RecordedSensor:
+    """Leaves ``uav_rssi`` and ``uav_rssi_mask``."""
+    values, there = _by_end(recording, grid, "uav_rssi", len(recording.robots))
+    leaves = {
+        "uav_rssi": as_series([v[..., 0] for v in values]),
+        "uav_rssi_mask": as_series(there),
+    }
+    return RecordedSensor(sensor, leaves, dropped=_dropped(recording, "uav_rssi"))
+
+
+def recorded_light(recording: Recording, grid: Grid, sensor: Light) -> RecordedSensor:
+    """Leaves ``light``, ``light_direction``, ``light_mask`` and ``light_map``."""
+    values, there = _by_end(recording, grid, "light", len(sensor.lamps))
+    directions = [v[..., 1:].reshape(grid.count, -1) for v in values]
+    return RecordedSensor(
+        sensor,
+        {
+            "light": as_series([v[..., 0] for v in values]),
+            "light_direction": as_series(directions),
+            "light_mask": as_series(there),
+        },
+        {"light_map": torch.tensor(sensor.lamps, dtype=torch.float32).flatten()},
+        _dropped(recording, "light"),
+    )
+
+
+def recorded_echoes(recording: Recording, grid: Grid, sensor: Ultrasonic) -> RecordedSensor:
+    """Leaves ``ultrasonic`` and ``ultrasonic_mask``: the newest sample of each step, of the beams
+    that have an echo within reach."""
+    values, masks = [], []
+    for table in recording.streams["ultrasonic"]:
+        seen, there = last_on(grid, table)
+        heard = there[:, None] & (seen <= sensor.reach)
+        values.append(np.where(heard, seen, 0.0))
+        masks.append(heard)
+    leaves = {"ultrasonic": as_series(values), "ultrasonic_mask": as_series(masks)}
+    return RecordedSensor(sensor, leaves, dropped=_dropped(recording, "ultrasonic"))
+
+
+def _by_end(
+    recording: Recording, grid: Grid, stream: str, count: int
+) -> tuple[list[Floats], list[Any]]:
+    """Numbers [T, count, F] by what they are of, and where there are any."""
+    tables = recording.streams[stream]
+    slots = [table.values[:, 0].astype(np.int64) for table in tables]
+    return once(recording, grid, stream, slots, count, slice(1, None))
+
+
+def _loss(model: StrengthModel) -> PathLoss:
+    return PathLoss(model.std, model.power, model.exponent)
+
+
+def _places(recording: Recording, kind: str) -> tuple[tuple[float, ...], ...]:
+    return tuple(_tuple(place) for place in recording.places[kind].values())
+
+
+def _tuple(place: Floats) -> tuple[float, ...]:
+    return tuple(place.tolist())
+
+
+def _dropped(recording: Recording, stream: str) -> dict[str, int]:
+    return {stream: recording.dropped.get(stream, 0)}
