@@ -12,9 +12,7 @@ from torchrl.objectives import LossModule
 from agents import make
 from agents.particle.evidence_corrector import EvidenceCorrector
 from agents.particle.filter import Particles
-from agents.policies.adapters import LocalizerPolicy
 from agents.weights import learned
-from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.options import Factor, Share
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
@@ -28,13 +26,19 @@ from training.learning.collectors import (
     Seed,
     Steps,
     Worlds,
-    episode_collector,
     require_batches,
     world_seed,
 )
+from training.learning.comparison import compared
 from training.learning.run import Progress, Training, make_trainer
-from training.learning.through_time import cosine, far_off, masked_mean, run_again, with_belief
-from training.learning.trust import negative_log_likelihood
+from training.learning.through_time import (
+    cosine,
+    episodes,
+    far_off,
+    masked_mean,
+    negative_log_likelihood,
+    run_again,
+)
 
 # Broad clouds: ranges to anchors from anywhere, with NLOS and without, and to two, which leave a
 # circle; and narrow ones, which must not get worse.
@@ -136,12 +140,7 @@ def pf_corrected(
         for group in optimizer.param_groups:
             group["lr"] = cosine(learning_rate, last_rate, epoch / max(1, epochs - 1))
         first = world_seed(seed, epoch, worlds * len(scenarios))
-        collectors = []
-        for i, (localizer, one) in enumerate(zip(filters, scenarios, strict=True)):
-            env = CoLocEnv(one, worlds, device, seed=first + i * worlds)
-            policy = LocalizerPolicy(localizer, one, record=partial(with_belief, i))
-            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
-        return RoundRobin(collectors)
+        return RoundRobin(episodes(filters, scenarios, worlds, steps, device, first))
 
     collector = EpochCollector(collect, epochs)
     return Training(
@@ -165,15 +164,10 @@ def score(
 ) -> Mapping[str, Any]:
     """RMSE (m) of the filter and of ``apf`` in the worlds of seeds 0 … runs − 1 of some variants,
     each with its usual number of particles."""
-    found: dict[str, Any] = {}
-    for variant in SCORED if runs else ():
-        one = parse_scenario(scenario, variant)
+
+    def agents(one: Scenario) -> dict[str, Any]:
         corrected: Any = make("pf_corrected:weights=none", one)
         corrected.learn(network)
-        each = {}
-        for name, agent in (("pf_corrected", corrected), (PLAIN, make(PLAIN, one))):
-            result = record(agent, one, torch.arange(runs))
-            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
-        found[variant or "default"] = each
-        progress("scoring", len(found), len(SCORED))
-    return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found
+        return {"pf_corrected": corrected, PLAIN: make(PLAIN, one)}
+
+    return compared(SCORED, partial(parse_scenario, scenario), agents, runs, progress)

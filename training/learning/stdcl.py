@@ -10,11 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.policies.adapters import LocalizerPolicy
 from agents.stdcl.factors.network import FactorNetwork
 from agents.stdcl.stdcl import StDcl
 from agents.weights import learned
-from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.options import Factor, Quantity
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import parse_scenario
@@ -28,13 +26,19 @@ from training.learning.collectors import (
     Seed,
     Steps,
     Worlds,
-    episode_collector,
     require_batches,
     world_seed,
 )
+from training.learning.comparison import compared
 from training.learning.run import Progress, Training, make_trainer
-from training.learning.through_time import cosine, far_off, masked_mean, run_again, with_belief
-from training.learning.trust import negative_log_likelihood
+from training.learning.through_time import (
+    cosine,
+    episodes,
+    far_off,
+    masked_mean,
+    negative_log_likelihood,
+    run_again,
+)
 
 # Thirty UAVs in the density of swarm-v0's 200: from three neighbours each to dense networks.
 SCENARIO = "swarm-v0:n_uavs=30:size=5313,5313,2657:horizon=300"
@@ -143,11 +147,7 @@ def stdcl(
 
     def collect(epoch: int) -> Annealed:
         first = world_seed(seed, epoch, worlds * len(scenarios))
-        collectors = []
-        for i, (localizer, one) in enumerate(zip(localizers, scenarios, strict=True)):
-            env = CoLocEnv(one, worlds, device, seed=first + i * worlds)
-            policy = LocalizerPolicy(localizer, one, record=partial(with_belief, i))
-            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
+        collectors = episodes(localizers, scenarios, worlds, steps, device, first)
         batches = sum(one.horizon // steps for one in scenarios)
         return Annealed(collectors, lambda k: anneal((epoch + k / batches) / epochs))
 
@@ -185,15 +185,10 @@ def score(
 ) -> Mapping[str, Any]:
     """RMSE (m) of ``map`` with the network's factors and without, in the worlds of seeds
     0 … runs − 1 of some variants."""
-    found: dict[str, Any] = {}
-    for variant in SCORED if runs else ():
-        one = parse_scenario(scenario, variant)
+
+    def agents(one: Scenario) -> dict[str, Any]:
         localizer: Any = make(_AGENT, one)
         localizer.learn(network)
-        each = {}
-        for name, agent in (("trained", localizer), ("map", make(_BASE, one))):
-            result = record(agent, one, torch.arange(runs))
-            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
-        found[variant or "default"] = each
-        progress("scoring", len(found), len(SCORED))
-    return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found
+        return {"trained": localizer, "map": make(_BASE, one)}
+
+    return compared(SCORED, partial(parse_scenario, scenario), agents, runs, progress)

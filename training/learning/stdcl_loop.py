@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 
 from agents import make
-from agents.policies.adapters import LocalizerPolicy
 from agents.stdcl.loop import NetworkLoop
 from agents.stdcl.network import StGnn
 from agents.weights import learned
@@ -31,18 +30,18 @@ from training.learning.collectors import (
     Seed,
     Steps,
     Worlds,
-    episode_collector,
     require_batches,
     world_seed,
 )
+from training.learning.comparison import compared
 from training.learning.run import Progress, Training, make_trainer
 from training.learning.through_time import (
     FAR,
     cosine,
+    episodes,
     far_off,
     masked_mean,
     run_again,
-    with_belief,
 )
 
 # 60 to 150 UAVs; a radius of 15 km gives 60 of them the degree that 200 have at 5 km. Weaves and
@@ -187,14 +186,12 @@ def stdcl_loop(
             group["lr"] = cosine(learning_rate, last_rate, epoch / max(1, epochs - 1))
         loss.smooth = _SMOOTH if epoch >= smooth_from * epochs else 0.0
         first = world_seed(seed, epoch, worlds * len(scenarios))
-        collectors = []
-        for i, (loop, one) in enumerate(zip(loops, scenarios, strict=True)):
-            env: Any = CoLocEnv(one, worlds, device, seed=first + i * worlds)
-            if augment:
-                env = TransformedEnv(env, SwarmAugmentation(loop.base.std, first + i, device))
-            policy = LocalizerPolicy(loop, one, record=partial(with_belief, i))
-            collectors.append(episode_collector(env, policy, steps, compact_obs=True))
-        return RoundRobin(collectors)
+
+        def augmented(env: CoLocEnv, i: int) -> EnvBase:
+            return TransformedEnv(env, SwarmAugmentation(loops[i].base.std, first + i, device))
+
+        wrap = augmented if augment else None
+        return RoundRobin(episodes(loops, scenarios, worlds, steps, device, first, wrap))
 
     collector = EpochCollector(collect, epochs)
     trainer = make_trainer(collector, loss, optimizer, clip_norm=1.0)
@@ -217,15 +214,10 @@ def score(
 ) -> Mapping[str, Any]:
     """RMSE (m) of the loop and of its optimizer alone in the worlds of seeds 0 … runs − 1 of
     ``swarm-v0`` in some variants, with manoeuvres and layouts that training never saw."""
-    found: dict[str, Any] = {}
-    for variant in SCORED if runs else ():
-        scenario = parse_scenario("swarm-v0", variant)
+
+    def agents(scenario: Scenario) -> dict[str, Any]:
         loop: Any = make(agent, scenario)
         loop.learn(network)
-        each = {}
-        for name, one in (("trained", loop), ("optimizer", make(base, scenario))):
-            result = record(one, scenario, torch.arange(runs))
-            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
-        found[variant or "default"] = each
-        progress("scoring", len(found), len(SCORED))
-    return {"runs": runs, "seeds": [0, runs - 1], "rmse": found} if runs else found
+        return {"trained": loop, "optimizer": make(base, scenario)}
+
+    return compared(SCORED, partial(parse_scenario, "swarm-v0"), agents, runs, progress)

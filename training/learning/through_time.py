@@ -1,20 +1,26 @@
 """Backpropagation through a swarm localizer's steps: a batch that runs again, and its losses."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from agents.localizer import Estimate, Localizer
-from agents.policies.adapters import flat, restored
+from agents.policies.adapters import LocalizerPolicy, flat, restored
+from coloc_env.envs.torchrl import CoLocEnv
 from coloc_env.observation import Observation, all_leaves
 from coloc_env.scenario import Scenario
+from training.learning.collectors import episode_collector
 
 FAR = 3.0  # times the scale, beyond which a loss grows linearly
+_SOFT = 20.0  # Mahalanobis² beyond which a lost UAV's loss grows like its logarithm only
 
 
 def with_belief(
@@ -26,6 +32,26 @@ def with_belief(
         **flat(before),
         "variant": torch.full(before.batch_size[:1], variant, device=tensordict.device),
     }
+
+
+def episodes(
+    localizers: Sequence[Localizer[Any]],
+    scenarios: Sequence[Scenario],
+    worlds: int,
+    steps: int,
+    device: str,
+    first: int,
+    wrapped: Callable[[CoLocEnv, int], EnvBase] | None = None,
+) -> list[Collector]:
+    """Collectors of ``worlds`` worlds of each scenario, seeded from ``first`` on, in batches of
+    ``steps`` steps that are recorded ``with_belief``; ``wrapped`` changes the i-th environment."""
+    found = []
+    for i, (localizer, one) in enumerate(zip(localizers, scenarios, strict=True)):
+        env: Any = CoLocEnv(one, worlds, device, seed=first + i * worlds)
+        policy = LocalizerPolicy(localizer, one, record=partial(with_belief, i))
+        env = env if wrapped is None else wrapped(env, i)
+        found.append(episode_collector(env, policy, steps, compact_obs=True))
+    return found
 
 
 def run_again(
@@ -42,6 +68,18 @@ def run_again(
             belief = restored(localizer.reset(observation), begin, observation.batch_size)
         belief, estimate = localizer.step(belief, observation)
         yield estimate
+
+
+def negative_log_likelihood(
+    offset: Float[Tensor, "*s d"], covariance: Float[Tensor, "*s d d"]
+) -> Float[Tensor, "*s"]:
+    """½ (eᵀ P⁻¹ e + log det P) of a position's error, growing slowly where a UAV is lost."""
+    root = torch.linalg.cholesky(covariance)
+    scaled = torch.linalg.solve_triangular(root, offset.unsqueeze(-1), upper=False)[..., 0]
+    squared = scaled.square().sum(-1)
+    far = _SOFT * (1 + (squared.clamp_min(_SOFT) / _SOFT).log())
+    squared = torch.where(squared > _SOFT, far, squared)
+    return 0.5 * squared + root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def masked_mean(values: Float[Tensor, "*s"], mask: Bool[Tensor, "*s"]) -> Float[Tensor, ""]:

@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -25,8 +24,6 @@ from coloc_env.options import Factor
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario, parse_scenario
 from coloc_env.sensors import Landmarks, Ranging
-from training.evaluation import metrics
-from training.evaluation.record import record
 from training.learning.collectors import (
     EpochCollector,
     Epochs,
@@ -39,9 +36,11 @@ from training.learning.collectors import (
     require_batches,
     world_seed,
 )
+from training.learning.comparison import compared
 from training.learning.labels import Labels, smoothed
 from training.learning.left_out import Watched
 from training.learning.run import Progress, Training, make_trainer
+from training.learning.through_time import negative_log_likelihood
 
 # What the networks meet: each difficulty alone, all at once, nothing at all; and ranges unlike
 # those of the room: to anchors alone, by a motion model without IMU, with gross errors both ways,
@@ -65,19 +64,6 @@ VARIANTS = (
 )
 SCORED = ("", "nlos=0.3", "false_matches=0.1", "landmarks=5:nlos=0.3:false_matches=0.1")
 LabelName = Literal["truth", "left_out", "self_supervised"]
-_SOFT = 20.0  # Mahalanobis² beyond which a lost UAV's loss grows like its logarithm only
-
-
-def negative_log_likelihood(
-    offset: Float[Tensor, "*s d"], covariance: Float[Tensor, "*s d d"]
-) -> Float[Tensor, "*s"]:
-    """½ (eᵀ P⁻¹ e + log det P) of a position's error, growing slowly where a UAV is lost."""
-    root = torch.linalg.cholesky(covariance)
-    scaled = torch.linalg.solve_triangular(root, offset.unsqueeze(-1), upper=False)[..., 0]
-    squared = scaled.square().sum(-1)
-    far = _SOFT * (1 + (squared.clamp_min(_SOFT) / _SOFT).log())
-    squared = torch.where(squared > _SOFT, far, squared)
-    return 0.5 * squared + root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 class TrustLoss(LossModule):
@@ -261,20 +247,13 @@ def _first(start: str, seed: int) -> TrustNetwork:
 def score(network: TrustNetwork, base: str, runs: int, progress: Progress) -> Mapping[str, Any]:
     """RMSE (m) of ``ekf_trust`` and of a Huber EKF over 300 steps of the worlds of seeds
     0 … runs − 1 in some variants."""
-    found: dict[str, Any] = {}
-    if runs == 0:
-        return found
-    for variant in SCORED:
-        scenario = parse_scenario(base, f"horizon=300:{variant}".rstrip(":"))
+
+    def build(variant: str) -> Scenario:
+        return parse_scenario(base, f"horizon=300:{variant}".rstrip(":"))
+
+    def agents(scenario: Scenario) -> dict[str, Any]:
         ours: Any = make("ekf_trust:weights=none", scenario)
         ours.learn(network)
-        each = {}
-        for name, one in (
-            ("ekf_trust", ours),
-            ("ekf_huber", make("ekf:robust=huber", scenario)),
-        ):
-            result = record(one, scenario, torch.arange(runs))
-            each[f"{name}_rmse"] = metrics.rmse(result.error, result.worlds.scored)
-        found[variant or "default"] = each
-        progress("scoring", len(found), len(SCORED))
-    return {"runs": runs, "seeds": [0, runs - 1], "steps": 300, "rmse": found}
+        return {"ekf_trust": ours, "ekf_huber": make("ekf:robust=huber", scenario)}
+
+    return compared(SCORED, build, agents, runs, progress, steps=300)

@@ -25,7 +25,8 @@ from training.learning import run as runs
 from training.learning import trust as training
 from training.learning.collectors import episode_collector
 from training.learning.registry import TRAININGS
-from training.learning.trust import TrustLoss, negative_log_likelihood
+from training.learning.through_time import negative_log_likelihood
+from training.learning.trust import TrustLoss
 
 SMALL = {
     "scenario": "indoor-v0:n_uavs=3:horizon=10",
