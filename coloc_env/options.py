@@ -224,6 +224,11 @@ def typed(value: Any) -> str:
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
+def set_words(chosen: Mapping[str, Any]) -> list[str]:
+    """Options as words of a command line: ``--set key=value`` each."""
+    return [word for key, value in chosen.items() for word in ("--set", f"{key}={typed(value)}")]
+
+
 def require_known(what: str, wanted: Iterable[str] | None, known: Iterable[str]) -> None:
     """Raise ValueError for a wanted name that does not exist; None wants nothing in particular."""
     names = list(known)

@@ -90,6 +90,14 @@ def smooth(chain: Chain) -> Smoothed:
     return Smoothed(torch.stack(means, -2), torch.stack(covariances, -3), gain, *second)
 
 
+def diagonal_blocks(
+    matrix: Float64[Tensor, "*s N*a N*b"], count: int
+) -> Float64[Tensor, "*s N a b"]:
+    """The ``count`` blocks on a matrix's diagonal."""
+    apart = matrix.unflatten(-1, (count, -1)).unflatten(-3, (count, -1))
+    return apart.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+
+
 def block_diagonal(blocks: Float64[Tensor, "*s N a b"]) -> Float64[Tensor, "*s N*a N*b"]:
     """The block-diagonal matrix."""
     n = blocks.shape[-3]

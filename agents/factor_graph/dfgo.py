@@ -4,13 +4,13 @@ by condensed graphs (DDF-SAM, Cunningham, Paluri & Dellaert 2010)."""
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from torch import Tensor
 
 from agents.association import AssociationName, associated
 from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.chain import Chain, Smoothed, smooth
-from agents.factor_graph.condensed import arrived, condensed, tie
+from agents.factor_graph.condensed import Common, Tracks, arrived, condensed, tie
 from agents.factor_graph.mapped import MappedFactorGraph
 from agents.kalman.filter import elapsed, gaussian_estimate
 from agents.localizer import Estimate, Localizer
@@ -278,15 +278,29 @@ class DistributedFactorGraph(Localizer[SmootherBelief]):
         """The newest state and its covariance with the ranges of the window."""
         w, d = self.size, self.process.dim
         tracks = arrived(belief.sent[:, :, 0], observation, w, d, self.age)
-        place = tracks.position.transpose(2, 3)
         known = tracks.known.transpose(2, 3)
         if "neighbours" in observation:  # a slot may have been another UAV's
             known = known & (leaves["neighbours"] == observation["neighbours"].unsqueeze(2))
+        return self.tied_to(x, joint, tracks, tracks.position, known, leaves)
+
+    def tied_to(
+        self,
+        x: Float64[Tensor, "B N W S"],
+        joint: Float64[Tensor, "B N W W E E"],
+        tracks: Tracks,
+        position: Float64[Tensor, "B N S W d"],
+        known: Bool[Tensor, "B N W S"],
+        leaves: Observation,
+        common: Common | None = None,
+    ) -> tuple[Float64[Tensor, "B N S"], Float64[Tensor, "B N E E"]]:
+        """The newest state and its covariance with the window's ranges to neighbours on their
+        ``tracks``, which are at ``position`` (m)."""
+        place = position.transpose(2, 3)
         neighbours = Neighbours(place, torch.zeros_like(place), known)
 
         def linearize(delta: Tensor) -> list[Block]:
             at = self.process.boxplus(x, delta)
             return [m.linearize(self.process, at, leaves, neighbours) for m in self.shared]
 
-        found = tie(joint, tracks, linearize, self.robust)
+        found = tie(joint, tracks, linearize, self.robust, common=common)
         return self.process.boxplus(x[:, :, -1], found.delta[:, :, -1]), found.covariance

@@ -9,7 +9,7 @@ from torch import Tensor
 from agents.association import AssociationName
 from agents.errors import NotServed
 from agents.factor_graph.belief import SmootherBelief
-from agents.factor_graph.chain import Chain, Smoothed, block_diagonal, smooth
+from agents.factor_graph.chain import Chain, Smoothed, block_diagonal, diagonal_blocks, smooth
 from agents.factor_graph.dfgo import DistributedFactorGraph
 from agents.models.measurements import Block, Neighbours, make_measurements
 from agents.robust import SoftName
@@ -75,8 +75,7 @@ class CentralFactorGraph(DistributedFactorGraph):
         """The team's graph; of the result each UAV's part."""
         n, e = x.shape[1], self.process.error_size
         found = smooth(self.linearized(x, belief, leaves, heard))
-        blocks_of = found.covariance[:, -1:].unflatten(-1, (n, e)).unflatten(-3, (n, e))
-        own = blocks_of.diagonal(dim1=2, dim2=4).movedim(-1, 1)  # [B, N, 1, E, E]
+        own = diagonal_blocks(found.covariance[:, -1], n).unsqueeze(2)  # [B, N, 1, E, E]
         return Smoothed(
             found.mean.unflatten(-1, (n, e)).transpose(1, 2),
             own,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,12 +13,12 @@ from torch import Tensor
 from agents.errors import NotServed
 from agents.factor_graph.belief import SmootherBelief
 from agents.factor_graph.bordered import Bordered, Shared, Solved, solve
-from agents.factor_graph.chain import block_diagonal
-from agents.factor_graph.condensed import Common, arrived, condensed, tie
+from agents.factor_graph.chain import block_diagonal, diagonal_blocks
+from agents.factor_graph.condensed import Common, arrived, condensed
 from agents.kalman.filter import gaussian_estimate
 from agents.localizer import Estimate, Localizer
-from agents.models.measurements import Block, LandmarkVectors, Neighbours, no_neighbours
-from agents.slam.start import first_seen, uniform
+from agents.models.measurements import Block, LandmarkVectors, no_neighbours
+from agents.slam.maps import first_seen, others_maps, uniform
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.sensors import UnmappedLandmarks
@@ -156,15 +157,11 @@ class MappedFactorGraph(Localizer[MappedBelief]):
             about, shared = about.sum(1), shared.sum(1)
             off, start, slope = off[:, 0], start[:, 0], slope.flatten(1, 2)
         prior = Shared(start, (start @ off.unsqueeze(-1))[..., 0], slope)
-        mean = chain.mean - (slope @ off.unsqueeze(-1))[..., 0]
-        chain = type(chain)(
-            mean,
-            chain.covariance,
-            chain.transition,
-            chain.offset,
-            chain.noise,
-            chain.precision + precision,
-            chain.vector + vector,
+        chain = replace(
+            chain,
+            mean=chain.mean - (slope @ off.unsqueeze(-1))[..., 0],
+            precision=chain.precision + precision,
+            vector=chain.vector + vector,
         )
         return solve(Bordered(chain, prior, border, about, shared))
 
@@ -229,14 +226,8 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         heard = (observation["message_mask"] > 0) & theirs.isfinite().all(-1).unsqueeze(1)
         theirs = torch.where(theirs.isfinite(), theirs, 0.0)
         maps, precision = theirs[..., :size], theirs[..., size:].unflatten(-1, (size, size))
-        middle, variance = uniform(self.believed.arena, self.count, x)
-        start = (1 / variance).diag()
-        # Λ ← Λ + Σ_j (Λ_j − Λ₀), η ← η + Σ_j (Λ_j m_j − Λ₀ m₀)
-        vector = (precision @ maps.unsqueeze(-1))[..., 0] - middle / variance
-        weight = heard.double()
-        own = place.flatten(-2)
-        added = torch.einsum("bij,bjkl->bikl", weight, precision - start)
-        eta = torch.einsum("bij,bjk->bik", weight, vector) - (added @ own.unsqueeze(-1))[..., 0]
+        start, own = uniform(self.believed.arena, self.count, x), place.flatten(-2)
+        added, eta = others_maps(start, maps, precision, heard, own)
         spread = torch.linalg.inv(solved.shared.precision + added)
         shift = (spread @ eta.unsqueeze(-1))[..., 0]
         x = process.boxplus(x, (solved.slopes @ shift[:, :, None, :, None])[..., 0])
@@ -245,16 +236,8 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         tracks = arrived(sent[..., :-tail], observation, graph.size, d, graph.age, size)
         off = ((own + shift).unsqueeze(2) - maps.unsqueeze(1)).unsqueeze(3)  # of the map, from j's
         where = tracks.position + (tracks.slope @ off.unsqueeze(-1))[..., 0]
-        where = where.transpose(2, 3)
-        neighbours = Neighbours(where, torch.zeros_like(where), tracks.known.transpose(2, 3))
-
-        def linearize(delta: Tensor) -> list[Block]:
-            at = process.boxplus(x, delta)
-            return [m.linearize(process, at, leaves, neighbours) for m in graph.shared]
-
-        joint = solved.states.joint()
-        found = tie(joint, tracks, linearize, graph.robust, common=common)
-        return process.boxplus(x[:, :, -1], found.delta[:, :, -1]), found.covariance
+        known = tracks.known.transpose(2, 3)
+        return graph.tied_to(x, solved.states.joint(), tracks, where, known, leaves, common)
 
     # ---------------------------------------------------------------- parts
 
@@ -277,6 +260,4 @@ class MappedFactorGraph(Localizer[MappedBelief]):
         covariance = solved.states.covariance[..., -1, :, :] + slope @ spread
         if not self.centralized:
             return covariance
-        n, e = self.believed.arena.n_uavs, self.process.error_size
-        blocks = covariance.unflatten(-1, (n, e)).unflatten(1, (n, e))
-        return blocks.diagonal(dim1=1, dim2=3).movedim(-1, 1)
+        return diagonal_blocks(covariance, self.believed.arena.n_uavs)

@@ -22,15 +22,9 @@ MOST = 3.0  # the largest correction of a log-weight
 LARGEST_SCALE = 4.0  # of a log-likelihood; its inverse is the smallest
 _SOON = 5.0  # s, in which the time since the start is told apart
 _LIKELY = 10.0  # of a log-likelihood below the best, in which particles are told apart
+_MOVED = ("dx", "dy", "dz", "dvx", "dvy", "dvz")  # m, m/s: f of the PF-NN paper's equation 11
 FEATURES = (
-    *(
-        "dx",
-        "dy",
-        "dz",
-        "dvx",
-        "dvy",
-        "dvz",
-    ),  # ± log(1 + |f|), f of equation 11 of the PF-NN paper: m, m/s
+    *_MOVED,  # as ± log(1 + |f|)
     *("anchors_signed", "anchors_size", "anchors_largest"),  # ranges to anchors
     *("neighbours_signed", "neighbours_size", "neighbours_largest"),  # and to other UAVs
     *("others_signed", "others_size", "others_largest"),  # landmarks and all else

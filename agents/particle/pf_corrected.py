@@ -48,7 +48,7 @@ class CorrectedParticleFilter(AdaptiveParticleFilter):
         if self.printed:
             raise ValueError("variant=paper has the paper's own corrector: pfnn")
         if soft < 1.0:
-            self.resampling = SoftResampling.over(self.resampling, soft)
+            self.resampling = SoftResampling(self.resampling, soft)
         self.corrector = learned(EvidenceCorrector, weights, self.seed).requires_grad_(False)
 
     def learn(self, network: EvidenceCorrector) -> None:

@@ -14,15 +14,10 @@ class SoftResampling(Resampling):
     """Ancestors are drawn from q = α w + (1 − α) / M; an ancestor's particle gets the weight w / q,
     normalized: 1 / M for α = 1."""
 
-    alpha = 1.0
-
-    @staticmethod
-    def over(other: Resampling, alpha: float) -> "SoftResampling":
-        """As ``other``, with this α."""
-        floor = other.floor.tolist()
-        made = SoftResampling(other.space, floor, other.bounds, other.shrinkage)
-        made.alpha = alpha
-        return made
+    def __init__(self, like: Resampling, alpha: float) -> None:
+        """Of the space, floor, counts and moves of another."""
+        super().__init__(like.space, like.floor.tolist(), like.bounds, like.shrinkage)
+        self.alpha = alpha
 
     def resample_few(
         self,

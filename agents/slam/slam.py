@@ -21,7 +21,7 @@ from agents.models.process import make_process
 from agents.models.update import posterior
 from agents.robust import SoftName
 from agents.slam.joint import Joint, information
-from agents.slam.start import first_seen, uniform
+from agents.slam.maps import first_seen, others_maps, uniform
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount
@@ -217,21 +217,15 @@ class Slam(Localizer[MapBelief]):
     def _fused(
         self, own: Joint, sent: Float64[Tensor, "B N K"], observation: Observation
     ) -> tuple[Float64[Tensor, "B N S"], Float64[Tensor, "B N E E"]]:
-        """A UAV's state with the maps that have arrived, their common start Λ₀ taken off each:
-        Λ ← Λ + Σ_j (Λ_j − Λ₀), η ← η + Σ_j (Λ_j m_j − Λ₀ m₀)."""
+        """A UAV's state with the maps that have arrived."""
         size, e = self.count * self.process.dim, self.process.error_size
         heard = (observation["message_mask"] > 0) & sent.isfinite().all(-1).unsqueeze(1)
         mean = torch.where(sent.isfinite(), sent, 0.0)[..., :size]
-        middle, unknown = uniform(self.believed.arena, self.count, mean)
+        start = uniform(self.believed.arena, self.count, mean)
         spread = sent[..., size:].unflatten(-1, (size, size))
-        spread = torch.where(spread.isfinite(), spread, unknown.diag())
+        spread = torch.where(spread.isfinite(), spread, start[1].diag())
         precision = torch.linalg.inv(spread)
-        vector = (precision @ mean.unsqueeze(-1))[..., 0] - middle / unknown
-        precision = precision - (1 / unknown).diag()
-        weight = heard.double()
-        added = torch.einsum("bij,bjkl->bikl", weight, precision)
-        eta = torch.einsum("bij,bjk->bik", weight, vector)
-        eta = eta - (added @ own.landmarks.flatten(-2).unsqueeze(-1))[..., 0]
+        added, eta = others_maps(start, mean, precision, heard, own.landmarks.flatten(-2))
         whole = torch.zeros_like(own.covariance)
         whole[..., e:, e:] = added
         delta, covariance = posterior(own.covariance, whole, torch.nn.functional.pad(eta, (e, 0)))

@@ -211,7 +211,7 @@ def recorded_bearings(
     maps = {}
     if to_landmarks:
         maps["landmark_map"] = torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)
-    dropped = {stream: recording.dropped.get(stream, 0)}
+    dropped = dropped_of(recording, stream)
     return RecordedSensor(sensor, series, maps, dropped), depth
 
 
@@ -223,7 +223,7 @@ def recorded_ranges(recording: Recording, grid: Grid, sensor: Ranging) -> Record
         for t in recording.streams["uav_ranges"]
     ]
     ranges, there = _ranges(recording, grid, "uav_ranges", slots, robots * tags**2, slice(3, 4))
-    dropped = {"uav_ranges": recording.dropped.get("uav_ranges", 0)}
+    dropped = dropped_of(recording, "uav_ranges")
     return RecordedSensor(sensor, {"ranges": ranges, "range_mask": there}, dropped=dropped)
 
 
@@ -240,7 +240,7 @@ def recorded_anchor_ranges(
     ranges, there = _ranges(recording, grid, "anchor_ranges", slots, count, slice(2, 3))
     maps = {"anchor_map": torch.from_numpy(recording.anchors.ravel()).to(torch.float32)}
     leaves = {"anchor_ranges": ranges, "anchor_range_mask": there}
-    dropped = {"anchor_ranges": recording.dropped.get("anchor_ranges", 0)}
+    dropped = dropped_of(recording, "anchor_ranges")
     return RecordedSensor(sensor, leaves, maps, dropped)
 
 
@@ -261,7 +261,7 @@ def recorded_landmarks(recording: Recording, grid: Grid, sensor: Landmarks) -> R
             "landmark_mask": as_series(there),
         },
         {"landmark_map": torch.from_numpy(recording.landmarks.ravel()).to(torch.float32)},
-        {"landmark_vectors": recording.dropped.get("landmark_vectors", 0)},
+        dropped_of(recording, "landmark_vectors"),
     )
 
 
@@ -277,6 +277,11 @@ def lever_arms(recording: Recording) -> tuple[tuple[tuple[float, ...], ...], ...
     return tuple(tuple(tuple(arm) for arm in robot) for robot in recording.tags.tolist())
 
 
+def dropped_of(recording: Recording, stream: str) -> dict[str, int]:
+    """How many of a stream's measurements were left out, as ``RecordedSensor`` has it."""
+    return {stream: recording.dropped.get(stream, 0)}
+
+
 def newest(recording: Recording, grid: Grid, sensor: Sensor, stream: str) -> RecordedSensor:
     """A stream's own leaf and its mask, with the newest sample of each step."""
     tables = [last_on(grid, table) for table in recording.streams[stream]]
@@ -286,7 +291,7 @@ def newest(recording: Recording, grid: Grid, sensor: Sensor, stream: str) -> Rec
             stream: as_series([values for values, _ in tables]),
             f"{stream}_mask": as_series([there[:, None] for _, there in tables]),
         },
-        dropped={stream: recording.dropped.get(stream, 0)},
+        dropped=dropped_of(recording, stream),
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from coloc_env.datasets.grid import Grid, last_on
 from coloc_env.datasets.noise_model import NoiseModel, StrengthModel
 from coloc_env.datasets.recording import Floats, Recording
-from coloc_env.datasets.replay import as_series, newest, once
+from coloc_env.datasets.replay import as_series, dropped_of, newest, once
 from coloc_env.sensors import (
     Compass,
     Light,
@@ -68,7 +68,7 @@ def recorded_strengths(recording: Recording, grid: Grid, sensor: Rssi) -> Record
         sensor,
         {"rssi": as_series([v[..., 0] for v in values]), "rssi_mask": as_series(there)},
         {"rssi_map": torch.tensor(sensor.points, dtype=torch.float32).flatten()},
-        _dropped(recording, "rssi"),
+        dropped_of(recording, "rssi"),
     )
 
 
@@ -79,7 +79,7 @@ def recorded_uav_strengths(recording: Recording, grid: Grid, sensor: UavRssi) ->
         "uav_rssi": as_series([v[..., 0] for v in values]),
         "uav_rssi_mask": as_series(there),
     }
-    return RecordedSensor(sensor, leaves, dropped=_dropped(recording, "uav_rssi"))
+    return RecordedSensor(sensor, leaves, dropped=dropped_of(recording, "uav_rssi"))
 
 
 def recorded_light(recording: Recording, grid: Grid, sensor: Light) -> RecordedSensor:
@@ -94,7 +94,7 @@ def recorded_light(recording: Recording, grid: Grid, sensor: Light) -> RecordedS
             "light_mask": as_series(there),
         },
         {"light_map": torch.tensor(sensor.lamps, dtype=torch.float32).flatten()},
-        _dropped(recording, "light"),
+        dropped_of(recording, "light"),
     )
 
 
@@ -108,7 +108,7 @@ def recorded_echoes(recording: Recording, grid: Grid, sensor: Ultrasonic) -> Rec
         values.append(np.where(heard, seen, 0.0))
         masks.append(heard)
     leaves = {"ultrasonic": as_series(values), "ultrasonic_mask": as_series(masks)}
-    return RecordedSensor(sensor, leaves, dropped=_dropped(recording, "ultrasonic"))
+    return RecordedSensor(sensor, leaves, dropped=dropped_of(recording, "ultrasonic"))
 
 
 def _by_end(
@@ -130,7 +130,3 @@ def _places(recording: Recording, kind: str) -> tuple[tuple[float, ...], ...]:
 
 def _tuple(place: Floats) -> tuple[float, ...]:
     return tuple(place.tolist())
-
-
-def _dropped(recording: Recording, stream: str) -> dict[str, int]:
-    return {stream: recording.dropped.get(stream, 0)}

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from coloc_env.observation import action_width, message_leaves, sensed_leaves, static_leaves
+from coloc_env.options import set_words, typed
 from coloc_env.scenario import Scenario
 from coloc_env.sensors import Leaf
-from training.evaluation.tables import typed
 
 PART_BYTES = 64_000_000  # of a part, about
 _MOST_RUNS = 64  # in a part, which are run side by side
@@ -112,6 +112,5 @@ class Plan:
             words += ["--steps", str(self.steps)]
         if self.agent is not None:
             words += ["--agent", self.agent]
-        for key, value in self.scenario.overrides.items():
-            words += ["--set", f"{key}={typed(value)}"]
+        words += set_words(self.scenario.overrides)
         return shlex.join([*words, "--out", out])

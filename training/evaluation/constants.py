@@ -127,14 +127,14 @@ def table(
         figures = [short(here[label].figure) for label in (chosen, ours)]
         ends = [f"{short(here[label].figure)} ({label})" for label in (best, worst)]
         rows.append([dataset, chosen, *figures, *ends, f"{score[chosen] - score[best]:.3f}"])
-    title, caption, figure, ours = _WORDS[which]
+    title, caption, figure, believed = _WORDS[which]
     return {
         "title": title,
         "caption": caption,
         "command": command,
         "provenance": provenance,
         "header": [
-            *("left out", "chosen elsewhere", figure, f"with {ours}"),
+            *("left out", "chosen elsewhere", figure, f"with {believed}"),
             *("best here", "worst here", "lost to the best here, nats"),
         ],
         "align": ["left", "left", *["right"] * 5],

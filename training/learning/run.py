@@ -26,7 +26,7 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 from agents.weights import SUFFIX, Learned, card_of, shipped, write
 from coloc_env import options, state_file
 from coloc_env.json_files import read_json
-from coloc_env.options import Quantity, typed
+from coloc_env.options import Quantity, set_words
 from coloc_env.staging import locked, recover, remove_leftovers, staged_folder
 from training.devices import checked_device
 from training.learning import curves
@@ -324,9 +324,7 @@ def _config(folder: Path) -> dict[str, Any]:
 
 def _command(name: str, chosen: Mapping[str, Any], out: Path, device: str) -> str:
     """The command line that starts the same run, as a shell reads it."""
-    words = ["coloc", "train", name]
-    for key, value in chosen.items():
-        words += ["--set", f"{key}={typed(value)}"]
+    words = ["coloc", "train", name, *set_words(chosen)]
     words += [] if device == "cpu" else ["--device", device]
     return shlex.join([*words, "--out", str(out)])
 

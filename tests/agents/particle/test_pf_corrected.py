@@ -48,7 +48,7 @@ def resampled(alpha: float | None, log_weights: Tensor) -> tuple[Tensor, Tensor]
     m = log_weights.shape[-1]
     resampling = Resampling(Line(), [0.01], None)
     if alpha is not None:
-        resampling = SoftResampling.over(resampling, alpha)
+        resampling = SoftResampling(resampling, alpha)
     count, key = torch.full((1, 2), m), torch.tensor([[3, 8]])
     particles = normal(1, 2, m, 1, seed=1)
     weighed = resampling.weigh(particles, log_weights, count)
@@ -71,7 +71,7 @@ def test_with_alpha_1_it_is_plain_resampling() -> None:
 def test_ancestors_keep_w_over_q(alpha: float) -> None:
     """h = 0 and no noise leave particles where they were, which names their ancestors."""
     w = torch.softmax(4 * normal(1, 2, 30).double(), -1)
-    resampling = SoftResampling.over(Resampling(Line(), [0.0], None, 0.0), alpha)
+    resampling = SoftResampling(Resampling(Line(), [0.0], None, 0.0), alpha)
     particles = torch.arange(30.0).expand(1, 2, 30).unsqueeze(-1)
     count = torch.full((1, 2), 30)
     weighed = resampling.weigh(particles, w.log().float(), count)

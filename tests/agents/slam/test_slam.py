@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import least_squares
 
 from agents import make
+from agents.slam.maps import uniform
 from agents.slam.slam import MapBelief, Slam
-from agents.slam.start import uniform
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coloc_env.options import typed
+from coloc_env.options import set_words, typed
 from coloc_env.render.style import UAV_COLOURS
 from training.evaluation import metrics
 from training.evaluation.ellipsoids import half_axes, in_space
@@ -89,8 +89,7 @@ def command(runs: Runs) -> str:
     summary = runs.summary
     words = ["coloc", "evaluate", summary["scenario"], "--agents", ",".join(summary["agents"])]
     words += ["--runs", str(summary["runs"]), "--seed", str(summary["seed"])]
-    for key, value in (summary.get("overrides") or {}).items():
-        words += ["--set", f"{key}={typed(value)}"]
+    words += set_words(summary.get("overrides") or {})
     return shlex.join([*words, "--out", runs.name])
 
 

@@ -1,4 +1,5 @@
-"""What a map starts from: landmarks anywhere in the arena, then where they are first seen."""
+"""Maps: landmarks anywhere in the arena at first, then where they are first seen; and what others'
+maps add to one."""
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -33,3 +34,21 @@ def first_seen(
     times = counts.sum(2)
     total = (place.unflatten(1, shape) * counts).sum(2)
     return torch.where(times > 0, total / times.clamp_min(1.0), otherwise)
+
+
+def others_maps(
+    start: tuple[Float64[Tensor, "M"], Float64[Tensor, "M"]],
+    maps: Float64[Tensor, "B N M"],
+    precision: Float64[Tensor, "B N M M"],
+    heard: Bool[Tensor, "B N N"],
+    own: Float64[Tensor, "B N M"],
+) -> tuple[Float64[Tensor, "B N M M"], Float64[Tensor, "B N M"]]:
+    """What the maps (m, with their information Λ_j) of those who are ``heard`` add to a UAV's own
+    information and, about its ``own`` map, vector, their common ``start`` taken off each:
+    Λ ← Λ + Σ_j (Λ_j − Λ₀), η ← η + Σ_j (Λ_j m_j − Λ₀ m₀)."""
+    middle, variance = start
+    vector = (precision @ maps.unsqueeze(-1))[..., 0] - middle / variance
+    weight = heard.double()
+    added = torch.einsum("bij,bjkl->bikl", weight, precision - (1 / variance).diag())
+    eta = torch.einsum("bij,bjk->bik", weight, vector)
+    return added, eta - (added @ own.unsqueeze(-1))[..., 0]
