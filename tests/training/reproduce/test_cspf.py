@@ -16,7 +16,7 @@ from training.reproduce.results import Runs
 from training.reproduce.settings import Settings
 from training.reproduce.study import reproduce
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, judge
-from training.reproduce.work import WORLD
+from training.reproduce.work import WORLD, Piece
 
 RUNS = 100
 
@@ -51,8 +51,10 @@ def test_measures() -> None:
 
 
 def test_clouds_are_of_one_run_beside_its_truth() -> None:
-    runs = {"cspf": SimpleNamespace(steps=14)}
-    results: Any = SimpleNamespace(settings=SimpleNamespace(seed=0), runs=lambda key, agents: runs)
+    where = plan.world(2, 14, outliers=plan.PUBLISHED)
+    stored = clouds.compute(Piece(where, ("cspf",), 0, 1, plan.DRAWN), lambda *_: None)
+    runs = {(plan.drawn(2), "cspf", plan.DRAWN): clouds.load(where, *stored)}
+    results: Any = SimpleNamespace(get=lambda *what: runs.get(what))
     found = clouds.clouds(results, 2)
     assert found is not None
     assert found.particles.shape == (14, 3, 50, 2)

@@ -14,11 +14,14 @@ from agents import make
 from agents.stein.match_window import observed_matches
 from coloc_env.geometry import poses_in
 from coloc_env.sensors import RelativePose
+from training.evaluation.evaluate import Progress
 from training.evaluation.metrics import Flags
 from training.evaluation.rollout import rollout
 from training.reproduce.cspf import plan
 from training.reproduce.drawing import headline, panels
 from training.reproduce.results import Results
+from training.reproduce.store import Arrays, Facts
+from training.reproduce.work import Piece, Variant
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _WRONG = "#CC0000"
@@ -43,22 +46,16 @@ class Clouds:
         return self.truth.shape[1]
 
 
-def clouds(results: Results, dim: int) -> Clouds | None:
-    """The study's first world with the paper's share of outliers, run again; None where it has not
-    run ``cspf`` there."""
-    variant = plan.world(dim, outliers=plan.PUBLISHED)
-    known = results.runs(variant.key, ("cspf",))
-    if "cspf" not in known:
-        return None
-    scenario, poses = variant.build(), poses_in(dim)
-    sensor = scenario.believed.sensor(RelativePose)
+def compute(piece: Piece, progress: Progress) -> tuple[Arrays, Facts]:
+    """Run ``cspf``, and look at its particles."""
+    (agent,), scenario = piece.agents, piece.variant.build()
+    dim = scenario.arena.dim
+    poses, sensor = poses_in(dim), scenario.believed.sensor(RelativePose)
     assert sensor is not None
-    localizer = make("cspf", scenario)
     own = torch.arange(scenario.arena.n_uavs)
     linked = torch.ones(1, len(own), len(own), dtype=torch.bool)
-    seeds = torch.tensor([results.settings.seed])
     each: list[tuple[Tensor, ...]] = []
-    for step in rollout(localizer, scenario, seeds, min(plan.EARLY + 1, known["cspf"].steps)):
+    for step in rollout(make(agent, scenario), scenario, torch.tensor([piece.seed])):
         true = torch.cat((step.world.truth.position, step.world.truth.attitude), -1)[0].double()
         match = observed_matches(poses, step.observation, linked, False)
         holder = int(match.mask[0].any(-1).int().argmax())
@@ -68,7 +65,21 @@ def clouds(results: Results, dim: int) -> Clouds | None:
         wrong = bool((off[:dim].norm() > _FAR * sensor.std).item())
         particles = step.belief.x[0, own, own, :, :dim]
         each.append((particles, poses.between(true[:1], true)[:, :dim], ends, torch.tensor(wrong)))
-    return Clouds(*(torch.stack(parts) for parts in zip(*each, strict=True)))
+        progress(agent, step.k + 1, piece.size)
+    names = ("particles", "truth", "ends", "wrong")
+    parts = zip(*each, strict=True)
+    return {name: torch.stack(x).numpy() for name, x in zip(names, parts, strict=True)}, {}
+
+
+def load(variant: Variant, arrays: Arrays, facts: Facts) -> Clouds:
+    """What ``compute`` made."""
+    return Clouds(**{name: torch.from_numpy(x) for name, x in arrays.items()})
+
+
+def clouds(results: Results, dim: int) -> Clouds | None:
+    """The study's first world with the paper's share of outliers; None where it was not run."""
+    found: Clouds | None = results.get(plan.drawn(dim), "cspf", plan.DRAWN)
+    return found
 
 
 def plane(results: Results) -> Figure | None:

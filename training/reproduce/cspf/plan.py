@@ -2,6 +2,7 @@
 recordings; and the measures of a team that agrees."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from training.evaluation.metrics import Flags, Floats, rmse_per_run
 from training.reproduce.results import Runs
 from training.reproduce.settings import Settings
-from training.reproduce.work import Cell, Variant
+from training.reproduce.work import Cell, Kind, Variant
 
 TITLE = (
     "Arita & Namerikawa, Collaborative Stein Particle Filter for Cooperative Localization in "
@@ -33,6 +34,12 @@ EARLY, LATE = 150, 250  # steps after which convergence is measured
 TEAMS = (2, 5, 10, 20)
 PARTICLES = (20, 100, 200, 1000)
 CLOUDS = "clouds"  # a cell
+DRAWN = Kind(  # one run, whose particles the paper's figures show
+    "drawn",
+    "training.reproduce.cspf.clouds:compute",
+    "training.reproduce.cspf.clouds:load",
+    ("training.reproduce.cspf.clouds",),
+)
 NAMES = {
     "cspf": "CSPF",
     "cspf:consensus=false": "no consensus",
@@ -55,6 +62,11 @@ WRONG = (0.0, 0.2, 0.4)  # of MURP's poses
 MISTAKEN = (0.0, 0.1)  # of EuRoC's landmarks
 
 
+def drawn(dim: int) -> str:
+    """The name of the cell whose particles are drawn."""
+    return f"drawn in {dim}-D"
+
+
 def world(dim: int, steps: int | None = None, **overrides: Any) -> Variant:
     """A world of the paper's kind, with overrides."""
     key = "-".join((f"stein{dim}d", *(f"{k}={v}" for k, v in overrides.items())))
@@ -67,6 +79,8 @@ def paper(settings: Settings) -> Iterator[Cell]:
     for dim in DIMS:
         published = world(dim, settings.steps, outliers=PUBLISHED)
         yield Cell(published, (*METHODS, *BESIDE, *LITERAL), settings.runs)
+        early = min(EARLY + 1, settings.steps or EARLY + 1)
+        yield Cell(replace(published, steps=early), ("cspf",), kind=DRAWN, key=drawn(dim))
         for share in SHARES:
             yield Cell(world(dim, settings.steps, outliers=share), METHODS, settings.runs)
 
