@@ -79,8 +79,9 @@ def paper(settings: Settings) -> Iterator[Cell]:
     for dim in DIMS:
         published = world(dim, settings.steps, outliers=PUBLISHED)
         yield Cell(published, (*METHODS, *BESIDE, *LITERAL), settings.runs)
-        early = min(EARLY + 1, settings.steps or EARLY + 1)
-        yield Cell(replace(published, steps=early), ("cspf",), kind=DRAWN, key=drawn(dim))
+        steps = min(EARLY + 1, settings.steps or EARLY + 1)
+        early = replace(published, key=f"{published.key}-early", steps=steps)
+        yield Cell(early, ("cspf",), kind=DRAWN, key=drawn(dim))
         for share in SHARES:
             yield Cell(world(dim, settings.steps, outliers=share), METHODS, settings.runs)
 
