@@ -43,7 +43,7 @@ class Policy(GaussianMixin, Model):
         self.log_std = nn.Parameter(torch.full((self.num_actions,), -1.0))
 
     def compute(self, inputs: dict[str, Tensor], role: str) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.net(inputs["observations"]), {"log_std": self.log_std}
+        return self.net(inputs["observations"]).tanh(), {"log_std": self.log_std}
 
 
 class Value(DeterministicMixin, Model):
