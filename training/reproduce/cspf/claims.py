@@ -13,6 +13,7 @@ from training.reproduce.cspf.plan import (
     MISTAKEN,
     PUBLISHED,
     SEQUENCES,
+    SMOOTHER,
     TRIALS,
     WRONG,
     converged,
@@ -118,6 +119,16 @@ def real(settings: Settings) -> Iterator[Claim]:
             f"{name}: 20 particles end nearer to the truth than one", modes, "m", "above",
             needs=((key, "stein_vi"), (key, "stein_vi:particles=1")), figure=_several(_nearer),
         )  # fmt: skip
+        for rival, published in (
+            (SMOOTHER, "D²SLAM is further off"),
+            (f"{SMOOTHER}:robust=student", ""),
+            (f"{SMOOTHER}:robust=mixture", ""),
+        ):
+            yield Claim(
+                f"{name}: particles end nearer to the truth than a sliding-window smoother "
+                f"(`{rival}`)", published, "m", "above",
+                needs=((key, "stein_vi"), (key, rival)), figure=_several(_nearer),
+            )  # fmt: skip
     for trial, wrong in product(TRIALS, WRONG[1:]):
         key, words = murp(trial, wrong).key, f"MURP {trial}, outliers {wrong:g}"
         yield Claim(
