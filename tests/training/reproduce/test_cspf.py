@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from made import Made, runs_of
 
+from coloc_env.datasets import DataError
 from coloc_env.scenarios import make_scenario
-from training.reproduce.cspf import clouds, cspf, plan
+from training.evaluation.evaluate import evaluate
+from training.reproduce.cspf import clouds, cspf, particle_errors, plan
 from training.reproduce.cspf.claims import claims, real
 from training.reproduce.cspf.plan import converged, converged_over_time, late_nees, worst
 from training.reproduce.results import Runs
 from training.reproduce.settings import Settings
+from training.reproduce.store import Store
 from training.reproduce.study import reproduce
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, judge
 from training.reproduce.work import WORLD, Piece
@@ -66,6 +69,25 @@ def test_clouds_are_of_one_run_beside_its_truth() -> None:
     runs.clear()
     assert clouds.clouds(results, 2) is None
     assert clouds.plane(results) is clouds.coordinates(results) is clouds.space(results) is None
+
+
+def test_particles_errors_are_of_the_run_that_the_study_has(tmp_path: Path) -> None:
+    """Beside the smoother's run in the same world: the filter's estimate lies within its cloud."""
+    stein, smoother = ("stein_vi", plan.SMOOTHER)
+    where = plan.euroc(*plan.SHOWN, 12)
+    try:
+        where.build()
+    except DataError as error:
+        pytest.skip(str(error))
+    settings = Settings(tmp_path, 1, "real", 0, [stein, smoother], [where.key], 12)
+    reproduce(cspf(), settings)
+    assert (tmp_path / "errors.png").exists()
+    piece = Piece(where, (stein,), 0, 1, plan.ERRORS)
+    cloud = particle_errors.load(where, *piece.load(Store(settings.store)))
+    assert cloud.shape == (12, 20)
+    estimate = evaluate(where.build(), [stein], runs=1).agents[stein].error[0, :, 0]
+    assert (cloud.amin(-1).numpy() <= estimate).all()
+    assert (estimate <= cloud.amax(-1).numpy()).all()
 
 
 def found(good: bool) -> Made:
@@ -121,7 +143,8 @@ def test_claims_about_recordings_follow_the_runs(settings: Settings) -> None:
         runs.record.error[:] *= rng.uniform(0.9, 1.1, (RUNS, 1, 1))
         return runs
 
-    better, worse = ("stein_vi", plan.FAST), (WORLD, "stein_vi:particles=1", *plan.TEAM[1:])
+    better = ("stein_vi", plan.FAST)
+    worse = (WORLD, *plan.ALONE[1:], *plan.TEAM[1:])
     for good, verdict in ((True, REPRODUCED), (False, CONTRADICTED)):
         near, far = (0.1, 0.5) if good else (0.5, 0.1)
         there = {(a,): some(near) for a in better} | {(a,): some(far) for a in worse}

@@ -1,4 +1,4 @@
-"""The paper's figure 7: each particle's error on a recording, beside a sliding-window smoother's."""
+"""The paper's figure 7: each particle's error on a recording, beside a smoother's."""
 
 import torch
 from jaxtyping import Float64
@@ -38,7 +38,7 @@ def errors(results: Results) -> Figure | None:
     sliding-window smoother with Huber's loss (orange) in one run on a recording, a tenth of whose
     landmarks is mistaken (the paper's figure 7)."""
     where = plan.euroc(*plan.SHOWN)
-    particles = results.get(plan.SHOWN_ERRORS, "stein_vi", plan.ERRORS)
+    particles = results.get(where.key, "stein_vi", plan.ERRORS)
     runs = results.runs(where.key, ("stein_vi", plan.SMOOTHER))
     if particles is None or len(runs) < 2:
         return None
