@@ -16,7 +16,6 @@ from training.reproduce.cspf.claims import claims, real
 from training.reproduce.cspf.plan import converged, converged_over_time, late_nees, worst
 from training.reproduce.results import Runs
 from training.reproduce.settings import Settings
-from training.reproduce.store import Store
 from training.reproduce.study import reproduce
 from training.reproduce.verdicts import CONTRADICTED, NOT, REPRODUCED, UNKNOWN, judge
 from training.reproduce.work import WORLD, Piece
@@ -71,23 +70,28 @@ def test_clouds_are_of_one_run_beside_its_truth() -> None:
     assert clouds.plane(results) is clouds.coordinates(results) is clouds.space(results) is None
 
 
-def test_particles_errors_are_of_the_run_that_the_study_has(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_particles_errors_are_of_the_run_that_the_study_has() -> None:
     """Beside the smoother's run in the same world: the filter's estimate lies within its cloud."""
-    stein, smoother = ("stein_vi", plan.SMOOTHER)
-    where = plan.euroc(*plan.SHOWN, 12)
+    both, where = ("stein_vi", plan.SMOOTHER), plan.euroc(*plan.SHOWN, 12)
     try:
-        where.build()
+        scenario = where.build()
     except DataError as error:
         pytest.skip(str(error))
-    settings = Settings(tmp_path, 1, "real", 0, [stein, smoother], [where.key], 12)
-    reproduce(cspf(), settings)
-    assert (tmp_path / "errors.png").exists()
-    piece = Piece(where, (stein,), 0, 1, plan.ERRORS)
-    cloud = particle_errors.load(where, *piece.load(Store(settings.store)))
+    stored = particle_errors.compute(Piece(where, both[:1], 0, 1, plan.ERRORS), lambda *_: None)
+    cloud = particle_errors.load(where, *stored)
     assert cloud.shape == (12, 20)
-    estimate = evaluate(where.build(), [stein], runs=1).agents[stein].error[0, :, 0]
+    met = evaluate(scenario, both, runs=1, bound=False)
+    estimate = met.agents["stein_vi"].error[0, :, 0]
     assert (cloud.amin(-1).numpy() <= estimate).all()
     assert (estimate <= cloud.amax(-1).numpy()).all()
+    runs = {agent: Runs(met, agent) for agent in both}
+    results: Any = SimpleNamespace(get=lambda *_: cloud, runs=lambda *_: runs)
+    figure = particle_errors.errors(results)
+    assert figure is not None
+    assert len(figure.axes[0].lines) == 22
+    del runs[plan.SMOOTHER]
+    assert particle_errors.errors(results) is None
 
 
 def found(good: bool) -> Made:
