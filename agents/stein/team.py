@@ -85,12 +85,10 @@ class RelativeTeam(Localizer[B]):
         own: Float64[Tensor, "B N P"],
         covariance: Float64[Tensor, "B N d d"],
         origin: Float64[Tensor, "B N P"],
-        observation: Observation,
-        moved: Bool[Tensor, "B N"],
+        speed: Float64[Tensor, "B N d"],
     ) -> Estimate:
-        """Each UAV's estimate of itself (relative to UAV 0, at ``origin``; covariance in its own
-        body frame) in the world frame, its velocity by odometry (0 in the first step, before it
-        has ``moved``)."""
+        """Each UAV's estimate of itself (relative to UAV 0, at ``origin``; covariance and velocity
+        ``speed``, m/s, in its own body frame) in the world frame."""
         world = self.poses.compose(origin, own)
         position, attitude = self.poses.split(world)
         rotation = rotation_matrix(attitude)
@@ -98,11 +96,10 @@ class RelativeTeam(Localizer[B]):
         covariance = 0.5 * (covariance + covariance.mT)
         eye = torch.eye(self.poses.dim, dtype=covariance.dtype, device=covariance.device)
         first = (torch.arange(covariance.shape[1], device=covariance.device) == 0)[:, None, None]
-        speed = observation["odometry"][..., : self.poses.dim].double()
         return build(
             Estimate,
             own.shape[:2],
             position=position,
-            velocity=torch.where(moved.unsqueeze(-1), rotate(attitude, speed), 0.0),
+            velocity=rotate(attitude, speed),
             covariance=torch.where(first, _KNOWN * eye, covariance),
         )
