@@ -147,7 +147,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         scale, active = self._scale(belief), links & links.mT
         target = self._target(window, scale, shape[1], active)
         x = self._predict(belief, motion, dt)
-        edges = self._moved(belief.edges, motion.moved.unsqueeze(2), dt.unsqueeze(2))
+        edges = self._edges(belief, motion, dt)
         started = belief.started
         for _ in range(self.iterations):
             x, estimate, edges, started = self._iterate(x, edges, started, active, target)
@@ -183,7 +183,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         )
 
     def team(self, belief: SteinBelief) -> Float[Tensor, "B H N P"]:
-        return belief.estimate
+        return belief.estimate[..., : self.poses.size]
 
     def diagnostics(self, belief: SteinBelief) -> dict[str, Float[Tensor, "B N"]]:
         return {"inlier_share": belief.inliers}
@@ -210,14 +210,11 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         """Each UAV's own motion in a step of ``dt`` s."""
         return odometry.increments(self.poses, observation, dt)
 
-    def _moved(
-        self,
-        x: Float64[Tensor, "*s N P"],
-        motion: Float64[Tensor, "*s N P"],
-        dt: Float64[Tensor, "*s"],
-    ) -> Float64[Tensor, "*s N P"]:
-        """States relative to UAV 0 after the ``motion`` in ``dt`` s (equation 29)."""
-        return odometry.propagate(self.poses, x, motion)
+    def _edges(
+        self, belief: SteinBelief, motion: Motion, dt: Float64[Tensor, "B H"]
+    ) -> Float64[Tensor, "B H R N P"]:
+        """The dual variables, which move as the UAVs do."""
+        return odometry.propagate(self.poses, belief.edges, motion.moved.unsqueeze(2))
 
     def _remembered(
         self, window: MatchWindow, motion: Motion, dt: Float64[Tensor, "B H"], new: Matches
@@ -269,7 +266,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             draws = draws * draws.new_tensor(self.std)
             spread = motion.steps.to(torch.float32).sqrt()[:, :, None, :, None]
             d = self.poses.plus(d, draws * spread)
-        return self._moved(belief.x.transpose(2, 3), d, dt.unsqueeze(2)).transpose(2, 3)
+        return odometry.propagate(self.poses, belief.x.transpose(2, 3), d).transpose(2, 3)
 
     def _iterate(
         self,

@@ -1,16 +1,15 @@
 """Pre-integrated motion as a group, and states relative to UAV 0 that it moves (CSPF paper,
 equations 28 and 29).
 
-An *increment* is ``[Δp (m), Δv (m/s), ΔR (quaternion), Δt (s)]``: what a UAV's IMU alone says of its
-motion, in the body frame at its start, as if there were no gravity (Forster et al. 2017, eq. 33).
-Increments compose as elements of the Galilean group. A *state* is ``[pose (7), u (3)]``: a UAV's
+An *increment* is ``[Δp (m), Δv (m/s), ΔR (quaternion), Δt (s)]``: what a UAV's IMU alone says of
+its motion, in the body frame at its start, as if there were no gravity (Forster et al. 2017, eq.
+33). Increments compose as elements of the Galilean group. A *state* is ``[pose (7), u (3)]``: a UAV's
 pose relative to UAV 0's body frame, and its velocity less UAV 0's in that frame (m/s).
 
 Gravity pulls all UAVs alike, so it is not in the motion of one relative to another: nobody needs to
 know where down is, nor how fast UAV 0 moves.
 """
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -95,8 +94,8 @@ def propagate(
 def coasted(x: Float64[Tensor, "*s 10"], age: Float64[Tensor, "*s"]) -> Float64[Tensor, "*s 7"]:
     """z = [R, p − τ u], the pose τ = ``age`` s ago had the UAV moved uniformly.
 
-    A relative pose T of UAVs i and j measured τ s ago is T = A_i z_i⁻¹ z_j A_j⁻¹ in terms of present
-    states, A(τ) the ``recoil`` of what each one's IMU has integrated since.
+    A relative pose T of UAVs i and j measured τ s ago is T = A_i z_i⁻¹ z_j A_j⁻¹ by present states,
+    A(τ) the ``recoil`` of what each one's IMU has integrated since.
     """
     return concat((x[..., :3] - age.unsqueeze(-1) * x[..., 7:], x[..., 3:7]))
 

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.tensorclasses import build
 from agents.stein.galilean import Galilean
+from agents.tensorclasses import build
 from coloc_env.geometry import Poses
 from coloc_env.observation import Observation
 
