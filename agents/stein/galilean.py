@@ -2,9 +2,9 @@
 equations 28 and 29).
 
 An *increment* is ``[Δp (m), Δv (m/s), ΔR (quaternion), Δt (s)]``: what a UAV's IMU alone says of
-its motion, in the body frame at its start, as if there were no gravity (Forster et al. 2017, eq.
-33). Increments compose as elements of the Galilean group. A *state* is ``[pose (7), u (3)]``: a
-UAV's pose relative to UAV 0's body frame, and its velocity less UAV 0's in that frame (m/s).
+its motion, in the body frame at its start, as if there were no gravity (see ``preintegration``).
+Increments compose as elements of the Galilean group. A *state* is ``[pose (7), u (3)]``: a UAV's
+pose relative to UAV 0's body frame, and its velocity less UAV 0's in that frame (m/s).
 
 Gravity pulls all UAVs alike, so it is not in the motion of one relative to another: nobody needs to
 know where down is, nor how fast UAV 0 moves.

@@ -174,12 +174,9 @@ def _jacobian(window: InertialWindow, agents: int) -> Float64[Tensor, "B H W 6 E
     second[..., axis, 6 + axis] = -age.unsqueeze(-1)
     first = -Se3.adjoint(Se3.inverse(window.pose)) @ second
     index = torch.arange(1, agents, device=age.device)
-    at = [(i.unsqueeze(-1) == index).to(age.dtype) for i in (window.first, window.second)]
-    both = sum(
-        a[..., None, :, None] * end.unsqueeze(-2)
-        for a, end in zip(at, (first, second), strict=True)
-    )
-    return both.flatten(-2)
+    ends = (window.first, window.second)
+    here, there = ((i.unsqueeze(-1) == index).to(age.dtype)[..., None, :, None] for i in ends)
+    return (here * first.unsqueeze(-2) + there * second.unsqueeze(-2)).flatten(-2)
 
 
 def _shared(near: Kernel, steps: Float64[Tensor, "B H N m 9"]) -> Float64[Tensor, "B H N m 9"]:

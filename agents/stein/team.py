@@ -28,7 +28,7 @@ class RelativeTeam(Localizer[B]):
     sensor, without odometry (or what else they are ``moved_by``), or in a team with more UAVs than
     slots."""
 
-    serves = (RelativePose, Odometry)
+    serves: ClassVar[tuple[type[Sensor], ...]] = (RelativePose, Odometry)
     moved_by: ClassVar[type[Sensor]] = Odometry
 
     def __init__(self, believed: Believed, outliers: float, anneal: float) -> None:

@@ -9,7 +9,7 @@ from agents.models.preintegration import predict, preintegrate
 from agents.stein import inertial_window as windows
 from agents.stein.galilean import Galilean, RelativeStates, coasted, propagate
 from agents.stein.inertial_target import inertial_target
-from agents.stein.inertial_window import InertialNoise
+from agents.stein.inertial_window import InertialNoise, InertialWindow
 from agents.stein.likelihood import Scale
 from agents.stein.match_window import Matches
 from agents.stein.odometry import Motion
@@ -104,12 +104,14 @@ def test_tangents_lead_back() -> None:
 NOISE = InertialNoise((0.05, 0.03), 0.05, 0.003, 0.0, 0.0, 0.1)
 
 
-def window_of(before: Tensor, moved: Tensor, noise: Tensor, first: int, second: int) -> Tensor:
+def window_of(
+    before: Tensor, moved: Tensor, noise: Tensor, first: int, second: int
+) -> InertialWindow:
     """A match of B teams, with ``noise``, after each of K ``moved`` [B, K, N, 11]."""
     b = len(before)
     pose = Se3.plus(Se3.between(before[:, first, :7], before[:, second, :7]), noise)
-    ends = [torch.full((b, 1, 1), i) for i in (first, second)]
-    new = Matches(*ends, pose[:, None, None], torch.ones(b, 1, 1, dtype=torch.bool))
+    one, other = (torch.full((b, 1, 1), i) for i in (first, second))
+    new = Matches(one, other, pose[:, None, None], torch.ones(b, 1, 1, dtype=torch.bool))
     window = windows.insert(windows.empty(torch.Size((b, 1)), 1, before), new, NOISE)
     steps, dt = torch.ones(b, 1, UAVS, dtype=torch.int64), torch.full((b, 1), 0.1).double()
     for k in range(moved.shape[1]):
