@@ -160,6 +160,6 @@ class StGnn(Learned):
         so that their rounding does not depend on how many there are."""
         ends = graph.pairs.own(self.edge_nodes(h).mT).sum(-2)
         ends, links = (x.mT.unflatten(1, (-1, BLOCK)) for x in (ends, graph.link))
-        hidden = torch.tanh(self.edge(links) + ends)
+        hidden = torch.tanh(self.edge(links.contiguous()) + ends)
         logit: Tensor = self.edge_out(hidden)[..., 0]
         return sigmoid(logit.flatten(1))
