@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from agents.models.preintegration import preintegrate, samples_in
 from agents.particle.belief import normal
 from agents.stein import inertial_window as windows
 from agents.stein.cspf import SteinBelief, SteinFilter
 from agents.stein.estimate import Manifold
-from agents.stein.galilean import Galilean, RelativeStates, propagate
+from agents.stein.galilean import Galilean, RelativeStates, imu_increments, propagate
 from agents.stein.inertial_target import InertialTarget, inertial_target
 from agents.stein.inertial_window import InertialNoise, InertialWindow
 from agents.stein.likelihood import Scale
@@ -82,13 +81,7 @@ class InertialSteinFilter(SteinFilter):
     def _increments(
         self, observation: Observation, dt: Float64[Tensor, "B N"]
     ) -> Float64[Tensor, "B N 11"]:
-        """Pre-integrated samples (equation 28); none where they are not finite."""
-        samples, held = samples_in(observation, dt)
-        usable = samples.isfinite().all(-1) & held.isfinite()
-        samples = torch.where(usable.unsqueeze(-1), samples, 0.0)
-        held = torch.where(usable, held, 0.0)
-        found = preintegrate(samples, held, torch.zeros_like(samples[..., 0, :]), 0.0, 0.0)
-        return torch.cat((found.increments, found.duration.unsqueeze(-1)), -1)
+        return imu_increments(observation, dt)
 
     def _edges(
         self, belief: SteinBelief, motion: Motion, dt: Float64[Tensor, "B H"]

@@ -10,10 +10,13 @@ Gravity pulls all UAVs alike, so it is not in the motion of one relative to anot
 know where down is, nor how fast UAV 0 moves.
 """
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from agents.models.preintegration import preintegrate, samples_in
 from coloc_env.geometry import Se3, concat, rotate, rotate_by, unrotate
+from coloc_env.observation import Observation
 
 
 class Galilean:
@@ -72,6 +75,18 @@ class RelativeStates:
         """``y ⊟ x``: the tangent at ``x`` that leads to ``y``."""
         pose = Se3.minus(y[..., :7], x[..., :7])
         return concat((pose, unrotate(x[..., 3:7], y[..., 7:] - x[..., 7:])))
+
+
+def imu_increments(
+    observation: Observation, dt: Float64[Tensor, "B N"]
+) -> Float64[Tensor, "B N 11"]:
+    """Each UAV's pre-integrated samples of a step of ``dt`` s (equation 28); nothing of those that
+    are not finite."""
+    samples, held = samples_in(observation, dt)
+    usable = samples.isfinite().all(-1) & held.isfinite()
+    samples, held = torch.where(usable.unsqueeze(-1), samples, 0.0), torch.where(usable, held, 0.0)
+    found = preintegrate(samples, held, torch.zeros_like(samples[..., 0, :]), 0.0, 0.0)
+    return torch.cat((found.increments, found.duration.unsqueeze(-1)), -1)
 
 
 def propagate(

@@ -158,8 +158,8 @@ CHOSEN = {
     **dict.fromkeys(("fcmds", "gn"), ("anchors", "many", "tags")),
     "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
-    "cspf": ("stein2d", "stein3d", "stein_imu"),
-    **dict.fromkeys(("pf_joint", "pose_graph"), ("stein2d", "stein3d")),
+    **dict.fromkeys(("cspf", "pose_graph"), ("stein2d", "stein3d", "stein_imu")),
+    "pf_joint": ("stein2d", "stein3d"),
     **dict.fromkeys(("slam", "slam_central"), ("unmapped",)),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }

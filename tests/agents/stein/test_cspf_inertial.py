@@ -90,3 +90,10 @@ def test_flights_of_one_room_find_each_other(consensus: bool) -> None:
     agent = f"cspf:particles=10:consensus={str(consensus).lower()}"
     found = figures(flights, agent, 3, 170)
     assert bool((found["converged"][-1, :, 0] > 0).all()) is consensus
+
+
+@pytest.mark.slow
+def test_a_centre_with_imu_factors_finds_them_at_once() -> None:
+    """GTSAM's window of the whole team, with a fifth of all matches wrong."""
+    found = figures(team(), "pose_graph:every=15", 2, 60)
+    assert (found["converged"][-1] > 0).all()
