@@ -130,7 +130,7 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
             after = after.replace(estimate=estimate, covariance=covariance)
         origin = observation["reference"].double()
         return after, self.world_estimate(
-            after.estimate, after.covariance, origin, observation, dt > 0
+            after.estimate, after.covariance, origin, odometry.speed(poses, observation, dt > 0)
         )
 
     def team(self, belief: PoseGraphBelief) -> Float[Tensor, "B H N P"]:
