@@ -10,12 +10,15 @@ from coloc_env import geometry
 B, N, M = 2, 3, 40
 
 
+def unit(attitude: Tensor) -> Tensor:
+    return attitude if attitude.shape[-1] == 1 else torch.nn.functional.normalize(attitude, dim=-1)
+
+
 def attitudes(size: int, spread: float) -> tuple[Tensor, Tensor]:
     """One attitude a UAV, and a cloud about it, quaternions of either sign."""
     g = torch.Generator().manual_seed(size)
     about = 3 * torch.randn(B, N, size, generator=g)
-    if size == 4:
-        about = torch.nn.functional.normalize(about, dim=-1)
+    about = unit(about)
     delta = spread * torch.randn(B, N, M, 3 if size == 4 else 1, generator=g)
     cloud = geometry.rotate_by(about.unsqueeze(-2), delta)
     if size == 4:
@@ -32,7 +35,7 @@ def test_a_turn_is_what_matrices_differ_by(size: int, spread: float) -> None:
     turn = rotations.turn(cloud, about)
     by = rotations.turn_map(dim, turn.dtype, turn.device)
     found = (turn.mT @ by).unflatten(-1, (dim, dim)).double()
-    own, centre = (geometry.rotation_matrix(x.double()) for x in (cloud, about))
+    own, centre = (geometry.rotation_matrix(unit(x.double())) for x in (cloud, about))
     expected = centre.mT.unsqueeze(2) @ own - torch.eye(dim, dtype=torch.float64)
     torch.testing.assert_close(found, expected, rtol=0, atol=3e-6 if spread > 1 else 5e-7)
 
