@@ -4,7 +4,7 @@ All scalars are dimensionless: lengths are in standard deviations of a range or 
 position. Sums over links are weighted means, so that networks transfer to teams of other sizes.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float64
@@ -12,7 +12,8 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.swarm.belief import Solution, StepInput
-from agents.swarm.links import along_links, lengths, own_information
+from agents.swarm.links import own_information
+from agents.swarm.pairs import Pairs, norm
 
 SCALARS = (
     *("log_degree", "fixed_neighbours", "fixed", "confidence"),
@@ -30,6 +31,7 @@ _CLIP = 5.0  # standard deviations
 _SOFT = 2.0
 _TUKEY = 4.685
 _LINK_TIME = 8.0  # steps over which a link's residual is averaged
+_KEPT = 1 - 1 / _LINK_TIME  # of what it counts, in a step without a range
 _SECOND = 1.0  # s: relative speeds count as what they add up to in a step of training
 _TIMES = (10.0, 40.0)  # steps over which innovations are averaged
 
@@ -46,22 +48,25 @@ class RunningMeans(TensorClass):
 
 @dataclass(frozen=True)
 class GraphInputs:
-    """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, scalars of each ``link`` and
-    which links exist (``mask``), how fast their ends move ``apart`` (‖Δv_ij‖, m/s; 0 without a
-    link), which nodes are ``free``; of displacements through ranges: the
-    ``position`` (m, centred) and ``length`` (m) of links, their ``weight`` W_ij (1/m²), and
-    ``gain`` H_i⁻¹ (m²), H_i = Σ_j W_ij u uᵀ + λ I with the prior's ``precision`` λ (1/m²); and the
-    ``max_offset`` δ_max of corrections (m)."""
+    """Inputs of the network: ``scalars`` and ``vectors`` (m) of nodes, which of them are ``free``;
+    the list of links (``pairs``), scalars of each ``link``, how fast its ends move ``apart``
+    (‖Δv_ij‖, m/s), its ``unit`` vector, ``residual`` less its shift (m), and ``weight`` W_ij and
+    W_ji (1/m²); of displacements through ranges: the ``position`` y (m, centred), the matrix
+    W_ij/‖y_i − y_j‖² of their ``coupling`` (1/m⁴), and the ``gain`` H_i⁻¹ (m²),
+    H_i = Σ_j W_ij u uᵀ + λ I with the prior's ``precision`` λ (1/m²); and the ``max_offset`` δ_max
+    of corrections (m)."""
 
     scalars: Float64[Tensor, "B N F"]
     vectors: Float64[Tensor, "B N d C"]
-    link: Float64[Tensor, "B N N L"]
-    mask: Bool[Tensor, "B N N"]
-    apart: Float64[Tensor, "B N N"]
     free: Bool[Tensor, "B N"]
+    pairs: Pairs
+    link: Float64[Tensor, "B L E"]
+    apart: Float64[Tensor, "B E"]
+    unit: Float64[Tensor, "B d E"]
+    residual: Float64[Tensor, "B E"]
+    weight: Float64[Tensor, "B 2 E"]
     position: Float64[Tensor, "B N d"]
-    length: Float64[Tensor, "B N N"]
-    weight: Float64[Tensor, "B N N"]
+    coupling: Float64[Tensor, "B N N"]
     gain: Float64[Tensor, "B N d d"]
     precision: Float64[Tensor, "B N"]
     max_offset: Float64[Tensor, "B N"]
@@ -69,9 +74,12 @@ class GraphInputs:
     def to(self, like: Tensor) -> "GraphInputs":
         """The same in another precision."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return GraphInputs(
-            **{k: x if x.dtype == torch.bool else x.to(like) for k, x in parts.items()}
-        )
+        floats = {
+            name: x.to(like)
+            for name, x in parts.items()
+            if isinstance(x, Tensor) and x.is_floating_point()
+        }
+        return replace(self, **floats)  # type: ignore[arg-type]
 
 
 def initial_means(worlds: int, n: int, dim: int, device: torch.device) -> RunningMeans:
@@ -89,59 +97,63 @@ def initial_means(worlds: int, n: int, dim: int, device: torch.device) -> Runnin
 def graph_inputs(
     inputs: StepInput,
     solution: Solution,
-    weight: Float64[Tensor, "B N N"],
-    shift: Float64[Tensor, "B N N"],
+    weight: Float64[Tensor, "B E"],
+    shift: Float64[Tensor, "B E"],
     std: float,
     means: RunningMeans,
     max_offset: Float64[Tensor, "B N"],
 ) -> tuple[GraphInputs, RunningMeans]:
-    """The network's inputs for a step and its solution with those weights (1/m²) and shifts (m),
-    and the running means after it."""
-    mask, d = inputs.links.mask, solution.position.shape[-1]
-    y = solution.position - solution.position.mean(1, keepdim=True)
-    length = lengths(y)
-    residual = (inputs.links.distance - length) * mask
+    """The network's inputs for a step and its solution with those weights (1/m²) and shifts (m) of
+    its links, and the running means after it."""
+    pairs, d = inputs.links.pairs, solution.position.shape[-1]
+    there = pairs.there.double()
+    unit, length = pairs.units(solution.position)
+    residual = (inputs.listed.links.distance - length) * there
     innovation = torch.where(inputs.fixed.unsqueeze(-1), 0.0, inputs.prior - solution.position)
-    means = _updated(means, residual, mask, innovation)
-    variance = _own_variance(inputs, weight, d).unsqueeze(-2)
+    means, mean, seen = _updated(means, pairs, residual, innovation)
+    variance = pairs.other(_own_variance(inputs, pairs, weight, d))
+    weight = weight.unsqueeze(1)
     effective, precision = weight / (1 + weight * variance), 1 / inputs.variance  # W_ij, λ
-    eye = torch.eye(d, dtype=y.dtype, device=y.device)
-    h = own_information(y, effective, length) + precision[..., None, None] * eye  # H_i
+    eye = torch.eye(d, dtype=length.dtype, device=length.device)
+    y = solution.position - solution.position.mean(1, keepdim=True)
+    coupling = pairs.matrix(effective / length.square().unsqueeze(1))
+    h = own_information(y, coupling) + precision[..., None, None] * eye  # H_i
     root = torch.linalg.cholesky_ex(h).L
     gain = torch.cholesky_inverse(root)
     error = (residual / std).clamp(-_CLIP, _CLIP)
-    lasting = (means.residual / std).clamp(-_CLIP, _CLIP) * mask
-    uniform = std * mask.to(torch.float32) / (std**2 + variance)
-    strengths = (  # ψ(e_ij): linear, clipped, Tukey's, positive, averaged over time
-        effective * (residual - shift),
-        uniform * error.clamp(-_SOFT, _SOFT),
-        uniform * error * (1 - (error / _TUKEY).square()).clamp_min(0.0).square(),
-        uniform * error.clamp_min(0.0),
-        uniform * lasting,
+    lasting = (mean / std).clamp(-_CLIP, _CLIP) * there
+    uniform = std * there.unsqueeze(1) / (std**2 + variance)  # [B, 2, E]
+    robust = (  # clipped, Tukey's, positive, averaged over time
+        error.clamp(-_SOFT, _SOFT),
+        error * (1 - (error / _TUKEY).square()).clamp_min(0.0).square(),
+        error.clamp_min(0.0),
+        lasting,
     )
-    gradients = along_links(y.unsqueeze(1), torch.stack(strengths, 1), length.unsqueeze(1))
-    newton, *others = gradients.unbind(1)
+    psi = (effective * (residual - shift).unsqueeze(1), *(uniform * x.unsqueeze(1) for x in robust))
+    newton, *further = (pairs.along(x, unit) for x in psi)  # Σ_j ψ(e_ij) u_ij
     to_prior = precision.unsqueeze(-1) * innovation
-    steps = gain @ torch.stack((newton, to_prior, *others), -1)  # H_i⁻¹ Σ_j ψ(e_ij) u_ij
+    steps = gain @ torch.stack((newton, to_prior, *further), -1)  # H_i⁻¹ Σ_j ψ(e_ij) u_ij
     vectors = torch.cat((steps, innovation.unsqueeze(-1), means.innovations), -1)
     vectors = torch.where(inputs.fixed[..., None, None], 0.0, vectors)
-    confidence = (weight * std**2).clamp_max(1.0)
-    apart = lengths(inputs.state[..., d : 2 * d]) * mask
+    confidence = (weight[:, 0] * std**2).clamp_max(1.0)
+    apart = norm(pairs.apart(inputs.state[..., d : 2 * d]))
     each = (error, lasting, confidence, torch.log1p(apart * _SECOND / std))
     scalars = _scalars(inputs, solution, std, means, h, root, each)
     error, lasting, confidence, speed = each
-    link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(means.seen) / 3, confidence,
+    link = (error, error.abs(), lasting, lasting.abs(), torch.log1p(seen) / 3, confidence,
             speed / 4)  # fmt: skip
     graph = GraphInputs(
         scalars=scalars,
         vectors=vectors,
-        link=torch.stack(link, -1),
-        mask=mask,
-        apart=apart,
         free=~inputs.fixed,
-        position=y,
-        length=length,
+        pairs=pairs,
+        link=torch.stack(link, 1),
+        apart=apart,
+        unit=unit,
+        residual=residual - shift,
         weight=effective,
+        position=y,
+        coupling=coupling,
         gain=gain,
         precision=precision,
         max_offset=max_offset,
@@ -150,11 +162,11 @@ def graph_inputs(
 
 
 def _own_variance(
-    inputs: StepInput, weight: Float64[Tensor, "B N N"], dim: int
+    inputs: StepInput, pairs: Pairs, weight: Float64[Tensor, "B E"], dim: int
 ) -> Float64[Tensor, "B N"]:
     """Variance of each UAV (m² per axis) after its own links, which it adds to its neighbours'
     ranges: P⁻¹ ← P⁻¹ + ½ Σ_j W_ij / d."""
-    return inputs.variance / (1 + 0.5 * weight.sum(-1) / dim * inputs.variance)
+    return inputs.variance / (1 + 0.5 * pairs.sums(weight.unsqueeze(1)) / dim * inputs.variance)
 
 
 def _scalars(
@@ -169,11 +181,16 @@ def _scalars(
     """SCALARS of every UAV; ``root`` is the Cholesky factor of H, ``links`` the error, the mean
     error, the confidence and the relative speed of each link."""
     error, lasting, confidence, speed = links
-    count = inputs.links.mask.sum(-1).double()
-
-    def mean(of: Tensor) -> Tensor:
-        return of.sum(-1) / count.clamp_min(1.0)
-
+    pairs, there = inputs.links.pairs, inputs.links.pairs.there.double()
+    alike = (
+        *(there, confidence, error, error.square(), (error.abs() > _SOFT).double()),
+        *((error > _SOFT).double(), lasting, lasting.abs(), speed),
+    )
+    count, *sums = pairs.sums(torch.stack(alike, 1).unsqueeze(2)).unbind(1)
+    sums.append(pairs.sums(pairs.other(inputs.fixed.double()) * there.unsqueeze(1)))
+    trust, residual, square, far, long, lasts, lasts_size, parting, anchors = (
+        x / count.clamp_min(1.0) for x in sums
+    )
     d = h.shape[-1]
     volume = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1) / d
     size = (h.diagonal(dim1=-2, dim2=-1).sum(-1) / d).log()
@@ -190,21 +207,21 @@ def _scalars(
     own = torch.stack(
         (
             torch.log1p(count) / 4,
-            mean((inputs.links.mask & inputs.fixed.unsqueeze(-2)).double()),
+            anchors,
             inputs.fixed.double(),
-            mean(confidence),
+            trust,
             torch.log(inputs.variance / std**2) / 4,
             torch.log(solution.variance / std**2) / 4,
             torch.log(inputs.process_noise.clamp_min(1e-12) / std**2) / 4,
             size - volume,
             -(torch.log(inputs.variance) + volume) / 4,
-            mean(error),
-            mean(error.square()).sqrt(),
-            mean((error.abs() > _SOFT).double()),
-            mean((error > _SOFT).double()),
-            mean(lasting),
-            mean(lasting.abs()),
-            mean(speed) / 4,
+            residual,
+            square.sqrt(),
+            far,
+            long,
+            lasts,
+            lasts_size,
+            parting / 4,
         ),
         -1,
     )
@@ -213,31 +230,35 @@ def _scalars(
 
 
 def link_gain(
-    seen: Float64[Tensor, "B N N"], mask: Bool[Tensor, "B N N"]
-) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+    seen: Float64[Tensor, "B *L"], mask: Bool[Tensor, "B *L"]
+) -> tuple[Float64[Tensor, "B *L"], Float64[Tensor, "B *L"]]:
     """How many steps the running mean of each link holds after one, and what that counts in it:
     arithmetic at first, then exponential; the mean of a link without ranges loses its weight."""
-    seen = torch.where(mask, seen + 1, seen * (1 - 1 / _LINK_TIME))
+    seen = torch.where(mask, seen + 1, seen * _KEPT)
     return seen, (1 / seen.clamp_min(1.0)).clamp_min(1 / _LINK_TIME) * mask
 
 
 def _updated(
     means: RunningMeans,
-    residual: Float64[Tensor, "B N N"],
-    mask: Bool[Tensor, "B N N"],
+    pairs: Pairs,
+    residual: Float64[Tensor, "B E"],
     innovation: Float64[Tensor, "B N d"],
-) -> RunningMeans:
-    """The running means after a step: arithmetic at first, then exponential; the mean of a link
-    without ranges loses its weight."""
-    seen, gain = link_gain(means.seen, mask)
+) -> tuple[RunningMeans, Float64[Tensor, "B E"], Float64[Tensor, "B E"]]:
+    """The running means after a step, and those of its links' residuals and how often they were
+    seen: arithmetic at first, then exponential; the mean of a link without ranges loses its
+    weight."""
+    seen, gain = link_gain(pairs.of(means.seen), pairs.there)
+    mean = pairs.of(means.residual)
+    mean = mean + gain * (residual - mean)
     steps = means.steps + 1
     times = innovation.new_tensor(_TIMES)
     share = torch.maximum(1 / steps[..., None, None], 1 / times)
     innovations = means.innovations + share * (innovation.unsqueeze(-1) - means.innovations)
-    return RunningMeans(
-        residual=means.residual + gain * (residual - means.residual),
-        seen=seen,
+    means = RunningMeans(
+        residual=pairs.put(means.residual, mean),
+        seen=pairs.put(means.seen * _KEPT, seen),
         innovations=innovations,
         steps=steps,
         batch_size=means.batch_size,
     )
+    return means, mean, seen

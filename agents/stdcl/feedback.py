@@ -9,7 +9,6 @@ from torch import Tensor
 
 from agents.stdcl.network import Correction
 from agents.swarm.belief import Solution, StepInput
-from agents.swarm.links import lengths
 
 FeedbackKind = Literal["none", "paper", "links", "positions", "learned"]
 _MOST = 0.1  # of a confidence in a step: the paper's 10 %
@@ -26,6 +25,7 @@ class Feedback:
 
     positions = False  # the next step starts from the corrected positions
     links = False  # the links' confidence c_ij weights the next step's ranges
+    judged = False  # it is the network's
 
     def __init__(self, kappa: float = KAPPA) -> None:
         self.kappa = kappa
@@ -38,7 +38,7 @@ class Feedback:
         correction: Correction,
         std: float,
     ) -> Float64[Tensor, "B N N"]:
-        """The links' confidence after a step; without a range, as before."""
+        """The links' confidence after a step, of pairs without a range as before."""
         return before
 
 
@@ -51,7 +51,7 @@ class PositionFeedback(Feedback):
 class LinkFeedback(Feedback):
     """The network's confidence of each link weights the next step's ranges."""
 
-    links = True
+    links = judged = True
 
     def confidence(
         self,
@@ -62,9 +62,12 @@ class LinkFeedback(Feedback):
         std: float,
     ) -> Float64[Tensor, "B N N"]:
         """Nearer to the network's by at most 10 %, at least ``_C_MIN``."""
-        change = (correction.confidence.double().clamp_min(_C_MIN) / before).log()
-        after = before * torch.exp(_MAX_RATE * torch.tanh(change / _MAX_RATE))
-        return torch.where(inputs.links.mask, after, before)
+        assert correction.confidence is not None
+        pairs = inputs.links.pairs
+        c = pairs.of(before)
+        change = (correction.confidence.double().clamp_min(_C_MIN) / c).log()
+        c = c * torch.exp(_MAX_RATE * torch.tanh(change / _MAX_RATE))
+        return pairs.put(before, c)
 
 
 class LearnedFeedback(LinkFeedback):
@@ -90,9 +93,11 @@ class PaperFeedback(Feedback):
         correction: Correction,
         std: float,
     ) -> Float64[Tensor, "B N N"]:
-        residual = inputs.links.distance - lengths(corrected.position)
+        pairs = inputs.links.pairs
+        residual = inputs.listed.links.distance - pairs.units(corrected.position)[1]
         factor = torch.exp(-self.kappa * residual.abs() / std).clamp_min(1 - _MOST)
-        return torch.where(inputs.links.mask, (before * factor).clamp_min(_C_MIN), before)
+        c = (pairs.of(before) * factor).clamp_min(_C_MIN)
+        return pairs.put(before, c)
 
 
 FEEDBACKS: dict[FeedbackKind, type[Feedback]] = {

@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from agents.layers import Linear, sigmoid
 from agents.stdcl.features import LINKS, GraphInputs
-from agents.swarm.links import along_links
 
 FAST = 1.5  # times the mean relative speed of a UAV's links: from here on a link may be cut
 DOUBTED = 0.5  # confidence up to which it is: what equation 17 leaves a link flagged as NLOS
@@ -56,7 +55,7 @@ class TopologicalAttention(nn.Module):
         super().__init__()
         self.kinematic, self.cut = kinematic, kinematic and cut
         self.map = Linear(width, width)  # W
-        self.ends = Linear(width, 2)  # a, of h_i and of h_j
+        self.ends = Linear(width, 2)  # a, of h_j and of h_i
         self.relative = nn.Parameter(torch.tensor((-0.5, 1.0)))  # a, of ‖Δv‖ and of c
         self.keep = Linear(2 * width, width)  # W_z
         self.carry = nn.Parameter(torch.randn(channels, pushed) / channels**0.5)
@@ -66,7 +65,7 @@ class TopologicalAttention(nn.Module):
         self, graph: GraphInputs, h: Float[Tensor, "B N F"], v: Float[Tensor, "B N d C"]
     ) -> tuple[Float[Tensor, "B N F"], Float[Tensor, "B N d C"]]:
         mapped = self.map(h)
-        alpha = self.attention(graph, mapped)
+        alpha = graph.pairs.matrix(self.attention(graph, mapped))
         neighbours = alpha @ mapped
         z = sigmoid(self.keep(torch.cat((h, neighbours), -1)))
         h = z * h + (1 - z) * swish(neighbours)
@@ -77,37 +76,47 @@ class TopologicalAttention(nn.Module):
 
     def attention(
         self, graph: GraphInputs, mapped: Float[Tensor, "B N F"]
-    ) -> Float[Tensor, "B N N"]:
-        """α_ij of equation 28 from W h; 0 where there is no link, or a cut one."""
-        own, other = self.ends(mapped).unsqueeze(-2).unbind(-1)
-        logit, mask = own.mT + other, graph.mask
+    ) -> Float[Tensor, "B 2 E"]:
+        """α_ij and α_ji of equation 28 from W h; 0 for a link that is cut."""
+        pairs = graph.pairs
+        other, own = self.ends(mapped).unbind(-1)
+        logit = pairs.own(own) + pairs.other(other)
         if self.kinematic:
-            speed, confidence = graph.link[..., _SPEED], graph.link[..., _CONFIDENCE]
-            logit = logit + self.relative[0] * speed + self.relative[1] * confidence
+            speed, confidence = graph.link[:, _SPEED], graph.link[:, _CONFIDENCE]
+            relative = self.relative[0] * speed + self.relative[1] * confidence
+            logit = logit + relative.unsqueeze(1)
+        kept = pairs.there.unsqueeze(1)
         if self.cut:
-            mask = mask & ~cut_links(graph)
-        logit = functional.leaky_relu(logit, _SLOPE).masked_fill(~mask, -1e9)
-        return torch.softmax(logit, -1) * mask
+            kept = kept & ~cut_links(graph)
+        logit = functional.leaky_relu(logit, _SLOPE).masked_fill(~kept, -torch.inf)
+        most = pairs.own(pairs.largest(logit.detach()))  # so that no exp overflows
+        share = (logit - most.masked_fill(~kept, 0.0)).exp()
+        return share / pairs.own(pairs.sums(share)).clamp_min(1.0)
 
 
-def cut_links(graph: GraphInputs) -> Bool[Tensor, "B N N"]:
-    """Links that the attention of UAV i cuts: ‖Δv_ij‖ above ``FAST`` times the mean over its links,
-    and c_ij at most ``DOUBTED``."""
-    apart, count = graph.apart, graph.mask.sum(-1, keepdim=True).clamp_min(1)
-    mean = apart.sum(-1, keepdim=True) / count
-    doubted = graph.link[..., _CONFIDENCE] <= DOUBTED
-    return graph.mask & (apart > FAST * mean) & doubted
+def cut_links(graph: GraphInputs) -> Bool[Tensor, "B 2 E"]:
+    """Links that the attention of UAV i cuts, and of j: ‖Δv_ij‖ above ``FAST`` times the mean over
+    its links, and c_ij at most ``DOUBTED``."""
+    pairs, apart = graph.pairs, graph.apart.unsqueeze(1)
+    count = pairs.sums(pairs.there.unsqueeze(1).to(apart)).clamp_min(1)
+    mean = pairs.own(pairs.sums(apart) / count)
+    doubted = pairs.there & (graph.link[:, _CONFIDENCE] <= DOUBTED)
+    return (apart > FAST * mean) & doubted.unsqueeze(1)
 
 
 def pushed_by_ranges(graph: GraphInputs, v: Float[Tensor, "B N d C"]) -> Float[Tensor, "B N d C"]:
-    """H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j: a UAV's displacement by those of its neighbours (m)."""
-    y, weight, length, gain = graph.position, graph.weight, graph.length, graph.gain
-    at = v.movedim(-1, 1)  # [B, C, N, d]
-    along = (
-        y.unsqueeze(1) @ at.mT - (y.unsqueeze(1) * at).sum(-1).unsqueeze(-2)
-    ) / length.unsqueeze(1)
-    pushed = along_links(y.unsqueeze(1), weight.unsqueeze(1) * along, length.unsqueeze(1))
-    return gain @ pushed.movedim(1, -1)
+    """H_i⁻¹ Σ_j W_ij u_ij u_ijᵀ v_j: a UAV's displacement by those of its neighbours (m).
+
+    With s_ij = W_ij/‖y_i − y_j‖² the sum is Σ_j s_ij (y_i − y_j) (y_iᵀ v_j − y_jᵀ v_j); multiplied
+    out, products of the matrix s with what the neighbours have."""
+    y = graph.position.unsqueeze(-1)  # [B, N, d, 1]
+    d, own = y.shape[2], (y * v).sum(2, keepdim=True)  # y_jᵀ v_j
+    outer = (y.unsqueeze(2) * v.unsqueeze(3)).flatten(2, 3)  # v_j y_jᵀ, [B, N, d d, C]
+    parts = torch.cat((v, own, y * own, outer), 2)
+    sums = (graph.coupling @ parts.flatten(2)).view_as(parts)  # Σ_j s_ij (…)
+    v, own, first, outer = sums.split((d, 1, d, d * d), 2)
+    second = (y.unsqueeze(3) * outer.unflatten(2, (d, d))).sum(2)  # Σ_j s_ij y_j v_jᵀ y_i
+    return graph.gain @ (y * ((y * v).sum(2, keepdim=True) - own) + first - second)
 
 
 class DilatedConvolution(nn.Module):

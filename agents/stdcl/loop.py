@@ -17,7 +17,6 @@ from agents.swarm import joint
 from agents.swarm.anchored import is_plain
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.filter import SwarmFilter
-from agents.swarm.links import along_links
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, InsDriven
@@ -108,14 +107,14 @@ class NetworkLoop(Localizer[LoopBelief]):
             if self.feedback.links:
                 inputs = replace(inputs, confidence=belief.confidence)
             solution = self.base.solve(belief.base, inputs)
-            weight, shift = self.base.weights(solution.position, inputs)
+            weight, shift = self.base.weights(solution.position, inputs.listed)
             limit = self._max_offset(inputs, solution)
             graph, means = graph_inputs(
                 inputs, solution, weight, shift, self.std, belief.means, limit
             )
-        correction, convolutions = self.network(graph, belief.convolutions)
+        correction, convolutions = self.network(graph, belief.convolutions, self.feedback.judged)
         if torch.is_grad_enabled():
-            carrier = _gradient_carrier(belief, inputs, graph, shift)
+            carrier = _gradient_carrier(belief, graph)
             solution = replace(solution, position=solution.position + carrier)
         corrected = _corrected(inputs, solution, correction, self.rate)
         next_start = corrected if self.feedback.positions else solution
@@ -147,17 +146,15 @@ class NetworkLoop(Localizer[LoopBelief]):
         return MAX_OFFSET * torch.minimum(solution.variance, reduction).sqrt()
 
 
-def _gradient_carrier(
-    belief: LoopBelief, inputs: StepInput, graph: GraphInputs, shift: Float64[Tensor, "B N N"]
-) -> Float64[Tensor, "B N d"]:
+def _gradient_carrier(belief: LoopBelief, graph: GraphInputs) -> Float64[Tensor, "B N d"]:
     """Zeros with the gradient of the solution by what was fed back: prior positions m and
     confidences c_ij."""
-    m = belief.base.state[..., : graph.position.shape[-1]]
+    m = belief.base.state[..., : graph.vectors.shape[-2]]
     gradient = graph.precision.unsqueeze(-1) * (m - m.detach())  # λ ∂m
-    c = belief.confidence
+    c = graph.pairs.of(belief.confidence)
     change = c / c.detach() - 1  # ∂c_ij / c_ij
-    strength = change * graph.weight * (inputs.links.distance - graph.length - shift)
-    gradient = gradient + along_links(graph.position, strength, graph.length)
+    strength = graph.weight * (change * graph.residual).unsqueeze(1)
+    gradient = gradient + graph.pairs.along(strength, graph.unit)
     moved = (graph.gain @ gradient.unsqueeze(-1))[..., 0]  # H⁻¹ (…)
     return torch.where(graph.free.unsqueeze(-1), moved, 0.0)
 

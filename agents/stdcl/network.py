@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from agents.layers import Linear, sigmoid
 from agents.stdcl.features import LINKS, SCALARS, VECTORS, GraphInputs
 from agents.stdcl.layers import DilatedConvolution, TopologicalAttention, push, swish
+from agents.swarm.pairs import BLOCK
 from agents.weights import Learned
 
 _PUSHED = 4  # vector channels of neighbours' displacements through ranges
@@ -29,11 +30,11 @@ class ConvolutionState(TensorClass):
 @dataclass(frozen=True)
 class Correction:
     """``offset`` γ Δp (m) of each position, the ``variance_factor`` of its variance, and the
-    ``confidence`` that each link should have."""
+    ``confidence`` that each link should have (None: not asked for)."""
 
     offset: Float[Tensor, "B N d"]
     variance_factor: Float[Tensor, "B N"]
-    confidence: Float[Tensor, "B N N"]
+    confidence: Float[Tensor, "B E"] | None
 
 
 class StGnn(Learned):
@@ -102,8 +103,9 @@ class StGnn(Learned):
         )
 
     def forward(
-        self, graph: GraphInputs, past: ConvolutionState
+        self, graph: GraphInputs, past: ConvolutionState, judged: bool = True
     ) -> tuple[Correction, ConvolutionState]:
+        """The correction, and confidences of links where they are to be ``judged``."""
         graph = graph.to(self.out.weight)
         h, v = graph.scalars, graph.vectors
         for layer in self.encode:  # equation 27
@@ -117,7 +119,7 @@ class StGnn(Learned):
         gamma = self._gamma(graph).unsqueeze(-1)
         offset = gamma * limit * torch.tanh(size / limit) * (raw / size)  # γ δ_max tanh(·), eq. 34
         factor = torch.exp(_MAX_LOG_FACTOR * torch.tanh(self.sure(h)[..., 0] / _MAX_LOG_FACTOR))
-        return Correction(offset, factor, self._confidence(graph, h)), past
+        return Correction(offset, factor, self._confidence(graph, h) if judged else None), past
 
     def _gamma(self, graph: GraphInputs) -> Float[Tensor, "B N"]:
         """γ = σ(w c + b), c the mean confidence of a UAV's links (equation 35)."""
@@ -153,10 +155,11 @@ class StGnn(Learned):
             ConvolutionState(scalars=after[0], vectors=after[1], batch_size=past.batch_size),
         )
 
-    def _confidence(self, graph: GraphInputs, h: Tensor) -> Float[Tensor, "B N N"]:
-        """The confidence of each link, symmetric in its ends."""
-        n = h.shape[1]
-        ends, links = self.edge_nodes(h), self.edge(graph.link.flatten(1, 2))
-        hidden = torch.tanh(links.unflatten(1, (n, n)) + ends.unsqueeze(1) + ends.unsqueeze(2))
-        logit: Tensor = self.edge_out(hidden.flatten(1, 2))[..., 0]
-        return sigmoid(logit.unflatten(1, (n, n)))
+    def _confidence(self, graph: GraphInputs, h: Tensor) -> Float[Tensor, "B E"]:
+        """The confidence of each link, symmetric in its ends. Links are products of ``BLOCK`` rows,
+        so that their rounding does not depend on how many there are."""
+        ends = graph.pairs.own(self.edge_nodes(h).mT).sum(-2)
+        ends, links = (x.mT.unflatten(1, (-1, BLOCK)) for x in (ends, graph.link))
+        hidden = torch.tanh(self.edge(links.contiguous()) + ends)
+        logit: Tensor = self.edge_out(hidden)[..., 0]
+        return sigmoid(logit.flatten(1))

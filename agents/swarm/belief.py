@@ -1,6 +1,7 @@
 """What a swarm filter carries from step to step, the inputs of a step, and its solution."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -84,6 +85,23 @@ class StepInput:
     packet_loss: Float64[Tensor, "B N N"] | None = None
     confidence: Float64[Tensor, "B N N"] | None = None
     window: RangeWindow | None = None
+
+    @cached_property
+    def listed(self) -> "StepInput":
+        """The same with what concerns links as lists of ``links.pairs``."""
+        pairs = self.links.pairs
+
+        def of(x: Tensor | None) -> Tensor | None:
+            return None if x is None else pairs.of(x)
+
+        return replace(
+            self,
+            links=Links(pairs.of(self.links.distance), pairs.there, pairs),
+            pair_variance=pairs.of(self.pair_variance),
+            outlier_probability=of(self.outlier_probability),
+            packet_loss=of(self.packet_loss),
+            confidence=of(self.confidence),
+        )
 
 
 @dataclass(frozen=True)

@@ -115,11 +115,11 @@ def em_update(
 
 def weights_and_shifts(
     model: ErrorModel,
-    residual: Float64[Tensor, "B N N"],
-    length_variance: Float64[Tensor, "B N N"],
+    residual: Float64[Tensor, "B *L"],
+    length_variance: Float64[Tensor, "B *L"],
     std: float,
-    prior: Float64[Tensor, "B N N"] | None = None,
-) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+    prior: Float64[Tensor, "B *L"] | None = None,
+) -> tuple[Float64[Tensor, "B *L"], Float64[Tensor, "B *L"]]:
     """W = (1 − ω)/σ² + ω/s² (1/m²) and shift ω b / (s² W) (m) of each link: those of the mixture's
     quadratic lower bound at its residual, ω the responsibility of NLOS, from its ``prior``."""
     flat = None if prior is None else prior.flatten(1)

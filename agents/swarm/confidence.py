@@ -22,7 +22,7 @@ from agents.swarm.links import lengths
 ConfidenceKind = Literal["none", "huber", "em", "paper"]
 SolvedKind = Literal[ConfidenceKind, "gnc"]  # for solutions of several iterations
 _ENOUGH = 50.0  # remembered errors of links between anchors: with fewer, all links are used
-Weights = tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]
+Weights = tuple[Float64[Tensor, "B *L"], Float64[Tensor, "B *L"]]
 
 
 class Confidence(ABC):
@@ -32,7 +32,7 @@ class Confidence(ABC):
         self.std = std
 
     @abstractmethod
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         """Each link's weight W_ij (1/m²) and shift (m) at its residual (m)."""
 
     def schedule(
@@ -53,8 +53,8 @@ class Confidence(ABC):
         return inputs
 
     def information(
-        self, weight: Float64[Tensor, "B N N"], inputs: StepInput
-    ) -> Float64[Tensor, "B N N"]:
+        self, weight: Float64[Tensor, "B *L"], inputs: StepInput
+    ) -> Float64[Tensor, "B *L"]:
         """Fisher information (1/m²) of each range."""
         return weight
 
@@ -72,14 +72,14 @@ class Confidence(ABC):
 class UniformConfidence(Confidence):
     """All links alike: 1/σ²."""
 
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         return weights.uniform(residual, inputs.links.mask, self.std)
 
 
 class HuberConfidence(Confidence):
     """Huber's loss on each residual."""
 
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         return weights.huber(residual, inputs.links.mask, inputs.pair_variance, self.std)
 
 
@@ -96,7 +96,7 @@ class PaperConfidence(HuberConfidence):
         lost = (~inputs.links.mask).double()
         return replace(inputs, packet_loss=memory + (lost - memory) / calibration.MEMORY_STEPS)
 
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         assert inputs.packet_loss is not None
         weight, shift = super().weights(residual, inputs)
         c = weights.paper_confidence(residual, inputs.packet_loss, inputs.pair_variance, self.std)
@@ -113,7 +113,7 @@ class GncConfidence(Confidence):
     """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas & Carlone, RA-L
     2020): ranges beyond three deviations are outliers."""
 
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         """Those of the truncated loss itself."""
         weight, shift = weights.uniform(residual, inputs.links.mask, self.std)
         return weight * ((residual / self.std).square() < weights.TRUNCATED), shift
@@ -179,7 +179,7 @@ class EmConfidence(Confidence):
             inputs, error_model=model, transitions=transitions, outlier_probability=prior
         )
 
-    def weights(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         weight, shift = calibration.weights_and_shifts(
             inputs.error_model,
             residual,
@@ -190,8 +190,8 @@ class EmConfidence(Confidence):
         return weight * inputs.links.mask, shift
 
     def information(
-        self, weight: Float64[Tensor, "B N N"], inputs: StepInput
-    ) -> Float64[Tensor, "B N N"]:
+        self, weight: Float64[Tensor, "B *L"], inputs: StepInput
+    ) -> Float64[Tensor, "B *L"]:
         """Less than the weight: it is not known which of the components the error is of."""
         assert inputs.outlier_probability is not None
         each = calibration.fisher_information(
@@ -208,14 +208,15 @@ class EmConfidence(Confidence):
         assert prior is not None
         if solution.outlier is not None:
             return torch.where(inputs.links.mask, solution.outlier, prior)
+        pairs = inputs.links.pairs
         posterior = calibration.outlier_posterior(
             inputs.error_model,
-            solution.residual(inputs).detach().flatten(1),
-            solution.range_variance(inputs).flatten(1),
+            pairs.of(solution.residual(inputs).detach()),
+            pairs.of(solution.range_variance(inputs)),
             self.std,
-            prior.flatten(1),
+            pairs.of(prior),
         )
-        return torch.where(inputs.links.mask, posterior.view_as(prior), prior)
+        return pairs.put(prior, posterior)
 
     def diagnostics(self, belief: SwarmBelief) -> dict[str, Float64[Tensor, "B N"]]:
         sums, shape = belief.error_sums[:, 0], belief.step.shape

@@ -19,7 +19,7 @@ from agents.swarm.anchored import supports_anchors
 from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import ConfidenceKind
 from agents.swarm.filter import SwarmFilter
-from agents.swarm.majorization import TEAM_RELAXATION, link_descent, require_iterations
+from agents.swarm.majorization import TEAM_RELAXATION, require_iterations
 from coloc_env.options import Count, PositiveCount, PositiveSpeed, Quantity
 from coloc_env.scenario import Believed
 
@@ -90,22 +90,28 @@ class DynamicMds(SwarmFilter):
             past = window.information.sum(2) / self.process.dim
             majorant = precision + joint.laplacian(window.weight.sum(2), free)
             information = precision + joint.laplacian(past, free)
-        distance = inputs.links.distance
-        y, weighting, factor = inputs.prior, inputs, precision
+        pairs, weighting = inputs.links.pairs, inputs.listed
+        distance, y, factor = weighting.links.distance, inputs.prior, precision
         weight, shift = torch.zeros_like(distance), torch.zeros_like(distance)
         relaxation = TEAM_RELAXATION if self.dense else 1.0  # ω
         for k in range(self.first if bool(first_step.any()) else self.iterations):
             active = first_step | (k < self.iterations)  # other worlds have fewer iterations
+            unit, length = pairs.units(y)
             if k in _REWEIGHTED or k % _REWEIGHTED_EVERY == 0:
                 if k == _REWEIGHTED[-1] and bool(first_step.any()):
-                    weighting = self._first_reweighting(weight, information, inputs, first_step)
+                    each = self.confidence.information(weight, weighting)
+                    posterior = self._posterior(each, information, inputs, free)
+                    weighting = self._first_reweighting(posterior, inputs, first_step)
+                found = self.weights_at(distance - length, weighting)
                 weight, shift = (
-                    torch.where(active, new, old)
-                    for new, old in zip(self.weights(y, weighting), (weight, shift), strict=True)
+                    torch.where(active[..., 0], new, old)
+                    for new, old in zip(found, (weight, shift), strict=True)
                 )
-                v = joint.pin(joint.laplacian(weight, free) + majorant, inputs.fixed[:, free])
+                v = self._laplacian(weight, inputs, free) + majorant
+                v = joint.pin(v, inputs.fixed[:, free])
                 factor = torch.linalg.cholesky_ex(v).L  # V, the Laplacian of W plus Λ
-            descent = link_descent(y, distance - shift, weight)
+            strength = weight * (distance - shift - length)
+            descent = pairs.along(strength.unsqueeze(1), unit)
             if window is not None:
                 descent = descent + windows.descent(y, window)
             descent = torch.where(fixed, 0.0, descent)[:, free]
@@ -115,12 +121,11 @@ class DynamicMds(SwarmFilter):
         if self.v_max is not None:
             y = self._projected(belief, inputs, y)
         weight, shift = self.weights(y, weighting)
-        posterior = self._posterior(weight, information, inputs, free)
+        each = self.confidence.information(weight, weighting)
+        posterior = self._posterior(each, information, inputs, free)
         if window is not None:
-            each = self.confidence.information(weight, inputs)
-            window = windows.push(
-                window, inputs.prior, inputs.joint, distance - shift, weight, each
-            )
+            links = (pairs.matrix(x.unsqueeze(1)) for x in (distance - shift, weight, each))
+            window = windows.push(window, inputs.prior, inputs.joint, *links)
         return Solution(y, joint.marginal_variances(posterior), posterior, window)
 
     def decay_rate(
@@ -147,32 +152,34 @@ class DynamicMds(SwarmFilter):
         strength = adaptive.smoothing(inputs.links.mask, self.std).clamp_min(_NO_PRIOR)
         return torch.diag_embed(strength.unsqueeze(-1) * each)
 
+    def _laplacian(
+        self, weight: Float64[Tensor, "B E"], inputs: StepInput, free: Int64[Tensor, "M"]
+    ) -> Float64[Tensor, "B L L"]:
+        return joint.laplacian(inputs.links.pairs.matrix(weight.unsqueeze(1)), free)
+
     def _posterior(
         self,
-        weight: Float64[Tensor, "B N N"],
+        each: Float64[Tensor, "B E"],
         information: Float64[Tensor, "B L L"],
         inputs: StepInput,
         free: Int64[Tensor, "M"],
     ) -> Float64[Tensor, "B N e K"]:
-        """The joint covariance by the step's links and all other ``information`` (1/m²)."""
-        each = self.confidence.information(weight, inputs) / self.process.dim
-        total = joint.laplacian(each, free) + information
+        """The joint covariance by what ``each`` of the step's links informs, and all other
+        ``information`` (1/m²)."""
+        total = self._laplacian(each / self.process.dim, inputs, free) + information
         part = joint.posterior(total, inputs.fixed[:, free], inputs.variance[:, free])
         return joint.embed(part, free, inputs.variance)
 
     def _first_reweighting(
         self,
-        weight: Float64[Tensor, "B N N"],
-        information: Float64[Tensor, "B L L"],
+        posterior: Float64[Tensor, "B N e K"],
         inputs: StepInput,
         first_step: Bool[Tensor, "B 1 1"],
     ) -> StepInput:
-        """The inputs of worlds at their first step with the variance of the posterior: a prior much
-        wider than the noise cannot tell good ranges from bad."""
-        free = joint.free_indices(inputs.fixed)
-        posterior = self._posterior(weight, information, inputs, free)
+        """The listed inputs of worlds at their first step with the variance of the posterior: a
+        prior much wider than the noise cannot tell good ranges from bad."""
         variance = torch.where(first_step, joint.pair_variance(posterior), inputs.pair_variance)
-        return replace(inputs, pair_variance=variance)
+        return replace(inputs, pair_variance=variance).listed
 
     def _projected(
         self, belief: SwarmBelief, inputs: StepInput, y: Float64[Tensor, "B N d"]

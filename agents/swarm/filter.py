@@ -17,7 +17,7 @@ from agents.swarm.belief import Solution, StepInput, SwarmBelief
 from agents.swarm.confidence import CONFIDENCES, SolvedKind, Weights
 from agents.swarm.considered import Moments, after_step
 from agents.swarm.dead_reckoning import DeadReckoning, Predicted
-from agents.swarm.links import Links, connected, lengths, links_of, of_both_ends
+from agents.swarm.links import Links, links_of, of_both_ends
 from agents.swarm.window import RangeWindow
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
@@ -247,9 +247,9 @@ class SwarmFilter(Localizer[SwarmBelief]):
 
     def weights(self, y: Float64[Tensor, "B N d"], inputs: StepInput) -> Weights:
         """Each link's weight W_ij (1/m²) and shift (m) at positions y."""
-        return self.weights_at(inputs.links.distance - lengths(y), inputs)
+        return self.weights_at(inputs.links.distance - inputs.links.lengths(y), inputs)
 
-    def weights_at(self, residual: Float64[Tensor, "B N N"], inputs: StepInput) -> Weights:
+    def weights_at(self, residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
         """The same at residuals (m)."""
         return scaled(self.confidence.weights(residual, inputs), inputs.confidence)
 
@@ -281,7 +281,7 @@ class SwarmFilter(Localizer[SwarmBelief]):
         )
 
 
-def scaled(found: Weights, confidence: Float64[Tensor, "B N N"] | None) -> Weights:
+def scaled(found: Weights, confidence: Float64[Tensor, "B *L"] | None) -> Weights:
     """Weights times what links are trusted beside."""
     weight, shift = found
     return (weight if confidence is None else confidence * weight), shift
@@ -294,5 +294,6 @@ def _per_uav(x: Float64[Tensor, "B *s"], shape: torch.Size) -> Float64[Tensor, "
 
 def _localizable(inputs: StepInput, dim: int) -> Bool[Tensor, "B N"]:
     """Who is connected, over any number of links, to at least ``dim`` + 1 anchors."""
-    anchors = connected(inputs.links.mask).double() @ inputs.fixed.double().unsqueeze(-1)
-    return anchors[..., 0] > dim
+    component = inputs.links.pairs.components()
+    anchors = torch.zeros_like(component).scatter_add(1, component, inputs.fixed.long())
+    return anchors.gather(1, component) > dim

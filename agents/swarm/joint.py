@@ -66,9 +66,9 @@ def embed(
     e = part.shape[2]
     joint = independent(variance, e)
     rows = (e * index.unsqueeze(-1) + torch.arange(e, device=index.device)).flatten()
-    flat = joint.flatten(1, 2)
-    flat[:, rows.unsqueeze(-1), rows] = part.flatten(1, 2)
-    return joint
+    flat, part = joint.flatten(1, 2), part.flatten(1, 2)
+    wide = flat[:, rows].scatter(2, rows.expand_as(part), part)
+    return flat.index_copy(1, rows, wide).view_as(joint)
 
 
 def marginals(joint: Float64[Tensor, "B N e K"]) -> Float64[Tensor, "B N e e"]:
@@ -103,19 +103,17 @@ def information_of(
     covariance: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]
 ) -> Float64[Tensor, "B K K"]:
     """The inverse of a covariance for coordinates that are not ``fixed``; 0 for those that are."""
-    pairs = _fixed_pairs(fixed)
-    covariance = covariance.masked_fill(pairs, 0.0)
+    covariance = _without(covariance, fixed)
     covariance.diagonal(dim1=-2, dim2=-1).masked_fill_(fixed, 1.0)
-    return _inverse(covariance).masked_fill(pairs, 0.0)
+    return _without(_inverse(covariance), fixed)
 
 
 def laplacian(
     weight: Float64[Tensor, "B N N"], index: Int64[Tensor, "M"]
 ) -> Float64[Tensor, "B M M"]:
     """The rows and columns in ``index`` of Σ_{i<j} W_ij (e_i − e_j)(e_i − e_j)ᵀ."""
-    rows = weight[:, index]
-    matrix = -rows[..., index]
-    matrix.diagonal(dim1=-2, dim2=-1).add_(rows.sum(-1))
+    matrix = -weight[:, index.unsqueeze(-1), index]
+    matrix.diagonal(dim1=-2, dim2=-1).add_(weight[:, index].sum(-1))
     return matrix
 
 
@@ -136,21 +134,25 @@ def covariance_of(
     variance: Float64[Tensor, "B K"],
 ) -> Float64[Tensor, "B K K"]:
     """The inverse of an information matrix; ``fixed`` coordinates have ``variance`` (m²)."""
-    whole = _inverse(pin(information, fixed)).masked_fill(_fixed_pairs(fixed), 0.0)
+    whole = _without(_inverse(pin(information, fixed)), fixed)
     whole.diagonal(dim1=-2, dim2=-1).add_(torch.where(fixed, variance, 0.0))
     return whole
 
 
 def pin(matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]) -> Float64[Tensor, "B K K"]:
     """An information matrix whose ``fixed`` coordinates are independent and have 1 m⁻²."""
-    matrix = matrix.masked_fill(_fixed_pairs(fixed), 0.0)
+    matrix = _without(matrix, fixed)
     least = torch.full_like(fixed, _MIN_INFORMATION, dtype=torch.float32).masked_fill(fixed, 1.0)
     matrix.diagonal(dim1=-2, dim2=-1).add_(least)
     return matrix
 
 
-def _fixed_pairs(fixed: Bool[Tensor, "B K"]) -> Bool[Tensor, "B K K"]:
-    return fixed.unsqueeze(-1) | fixed.unsqueeze(-2)
+def _without(
+    matrix: Float64[Tensor, "B K K"], fixed: Bool[Tensor, "B K"]
+) -> Float64[Tensor, "B K K"]:
+    """The matrix with zeros in the rows and columns of ``fixed`` coordinates."""
+    rows = matrix.masked_fill(fixed.unsqueeze(-1), 0.0)
+    return rows.masked_fill_(fixed.unsqueeze(-2), 0.0)
 
 
 def _inverse(matrix: Float64[Tensor, "B K K"]) -> Float64[Tensor, "B K K"]:

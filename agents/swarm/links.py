@@ -1,11 +1,13 @@
 """Ranges between the members of a team, as symmetric matrices."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from agents.swarm.pairs import Pairs, pairs_of
 from coloc_env.observation import Observation
 from coloc_env.sensors.base import usable
 
@@ -13,10 +15,20 @@ from coloc_env.sensors.base import usable
 @dataclass(frozen=True)
 class Links:
     """Ranges d̃_ij between UAVs: ``distance`` in m (0 where there is none), ``mask``: which were
-    measured."""
+    measured. They are matrices [B, N, N], or lists [B, E] of the pairs ``listed``."""
 
-    distance: Float64[Tensor, "B N N"]
-    mask: Bool[Tensor, "B N N"]
+    distance: Float64[Tensor, "B *L"]
+    mask: Bool[Tensor, "B *L"]
+    listed: Pairs | None = None
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """The links that there are."""
+        return pairs_of(self.mask) if self.listed is None else self.listed
+
+    def lengths(self, y: Float64[Tensor, "B N d"]) -> Float64[Tensor, "B *L"]:
+        """Distances between members at y, as matrices or lists (m, 1e-9 at least)."""
+        return lengths(y) if self.listed is None else self.listed.units(y)[1]
 
 
 def links_of(observation: Observation) -> Links:
@@ -67,14 +79,8 @@ def of_both_ends(memory: Float64[Tensor, "B N M"]) -> Float64[Tensor, "B M M"]:
 
 def connected(mask: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N N"]:
     """Pairs in the same connected component of the network, each UAV with itself."""
-    reach = mask.clone()
-    reach.diagonal(dim1=-2, dim2=-1).fill_(True)
-    while True:
-        paths = reach.to(torch.float32)
-        further = paths @ paths > 0
-        if torch.equal(further, reach):
-            return reach
-        reach = further
+    first = pairs_of(mask).components()
+    return first.unsqueeze(-1) == first.unsqueeze(-2)
 
 
 def along_links(
@@ -86,12 +92,10 @@ def along_links(
 
 
 def own_information(
-    y: Float64[Tensor, "B N d"],
-    weight: Float64[Tensor, "B N N"],
-    length: Float64[Tensor, "B N N"],
+    y: Float64[Tensor, "B N d"], s: Float64[Tensor, "B N N"]
 ) -> Float64[Tensor, "B N d d"]:
-    """Σ_j W_ij u_ij u_ijᵀ (1/m²): information of links on a UAV whose neighbours are fixed."""
-    s = weight / length.square()
+    """Σ_j W_ij u_ij u_ijᵀ (1/m²), from s_ij = W_ij / ‖y_i − y_j‖² (1/m⁴): information of links on a
+    UAV whose neighbours are fixed."""
     d = y.shape[-1]
     outer = (y.unsqueeze(-1) * y.unsqueeze(-2)).flatten(-2)
     moments = s @ torch.cat((y, outer), -1)

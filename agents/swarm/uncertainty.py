@@ -39,7 +39,8 @@ def anchor_information(
     information = y.new_zeros(*y.shape, d)
     v = torch.where(fixed, variance, torch.inf)
     for _ in range(_HOPS):
-        information = own_information(y, linked / (noise + v.unsqueeze(-2)), length)
+        weight = linked / (noise + v.unsqueeze(-2))
+        information = own_information(y, weight / length.square())
         inverse = torch.linalg.inv_ex(information + _MIN_INFORMATION * eye).inverse
         own = inverse.diagonal(dim1=-2, dim2=-1).mean(-1)
         v = torch.where(fixed, variance, own.masked_fill(own > _MAX_VARIANCE, torch.inf))

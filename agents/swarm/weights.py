@@ -1,4 +1,7 @@
-"""Weights W_ij of links: uniform, Huber's, ST-DCL's confidence, and LOESS."""
+"""Weights W_ij of links: uniform, Huber's, ST-DCL's confidence, and LOESS.
+
+Uniform weights, Huber's and confidences are of matrices [B, N, N] or lists [B, E] of links alike.
+"""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -12,18 +15,18 @@ _NLOS, _LOSS, _C_MIN = 0.5, 0.3, 0.1  # coefficients of equation 17; the paper d
 
 
 def uniform(
-    residual: Float64[Tensor, "B N N"], mask: Bool[Tensor, "B N N"], std: float
-) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+    residual: Float64[Tensor, "B *L"], mask: Bool[Tensor, "B *L"], std: float
+) -> tuple[Float64[Tensor, "B *L"], Float64[Tensor, "B *L"]]:
     """Weights 1/σ² and no shifts."""
     return mask.double() / std**2, torch.zeros_like(residual)
 
 
 def huber(
-    residual: Float64[Tensor, "B N N"],
-    mask: Bool[Tensor, "B N N"],
-    variance: Float64[Tensor, "B N N"],
+    residual: Float64[Tensor, "B *L"],
+    mask: Bool[Tensor, "B *L"],
+    variance: Float64[Tensor, "B *L"],
     std: float,
-) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
+) -> tuple[Float64[Tensor, "B *L"], Float64[Tensor, "B *L"]]:
     """Weights min(1, 1.345 s/|r|)/σ² and no shifts; s² = σ² + the ``variance`` (m²) of the vector
     between the ends."""
     scale = HUBER * (std**2 + variance).sqrt()
@@ -48,11 +51,11 @@ def truncated(
 
 
 def paper_confidence(
-    residual: Float64[Tensor, "B N N"],
-    packet_loss: Float64[Tensor, "B N N"],
-    variance: Float64[Tensor, "B N N"],
+    residual: Float64[Tensor, "B *L"],
+    packet_loss: Float64[Tensor, "B *L"],
+    variance: Float64[Tensor, "B *L"],
     std: float,
-) -> Float64[Tensor, "B N N"]:
+) -> Float64[Tensor, "B *L"]:
     """c_ij = clip(1 − 0.5 s_ij − 0.3 ρ_ij, c_min, 1) (ST-DCL, equation 17): s_ij = 1 where the
     residual is flagged as NLOS, ρ_ij the rate of ``packet_loss``."""
     s = residual > _FLAGGED * (std**2 + variance).sqrt()

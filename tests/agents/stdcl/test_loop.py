@@ -24,9 +24,7 @@ from tests.agents.stdcl.test_network import STD, N, step_of
 
 
 def no_correction() -> Correction:
-    return Correction(
-        torch.zeros(2, N, 3), torch.ones(2, N), torch.ones(2, N, N, dtype=torch.float64)
-    )
+    return Correction(torch.zeros(2, N, 3), torch.ones(2, N), None)
 
 
 # ---------------------------------------------------------------- equation 36

@@ -33,7 +33,7 @@ def randomized(seed: int = 0, **chosen: Any) -> StGnn:
 
 
 def step_of(seed: int, reach: float = 900.0) -> tuple[StepInput, Solution, Tensor, Tensor]:
-    """A step of two small teams: its inputs, a solution, weights and shifts."""
+    """A step of two small teams: its inputs, a solution, weights and shifts, as matrices."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -75,13 +75,21 @@ def max_offset(solution: Solution) -> Tensor:
     return 3.0 * solution.variance.sqrt()
 
 
+def graph_of(step: Any, means: RunningMeans | None = None, std: float = STD) -> Any:
+    """The network's inputs for a step, and the running means after it."""
+    inputs, found, weight, shift = step
+    of = inputs.links.pairs.of
+    means = no_means(inputs.fixed.shape[1]) if means is None else means
+    return graph_inputs(inputs, found, of(weight), of(shift), std, means, max_offset(found))
+
+
 def corrections(network: StGnn, *steps: Any) -> list[Any]:
     """The network's corrections over some steps."""
     means, past, found = None, None, []
     for inputs, where, weight, shift in steps:
         means = no_means(inputs.fixed.shape[1]) if means is None else means
         past = network.start(inputs.fixed.shape, 3) if past is None else past
-        graph, means = graph_inputs(inputs, where, weight, shift, STD, means, max_offset(where))
+        graph, means = graph_of((inputs, where, weight, shift), means)
         correction, past = network(graph, past)
         found.append(correction)
     return found
@@ -138,7 +146,12 @@ def test_corrections_are_equivariant_to_permutations(seed: int) -> None:
     one = corrections(network, *steps)[-1]
     other = corrections(network, *(permuted(step, order) for step in steps))[-1]
     assert torch.allclose(other.offset, one.offset[:, order], rtol=1e-8, atol=1e-9)
-    assert torch.allclose(other.confidence, one.confidence[:, order][:, :, order], rtol=1e-8)
+    pairs = [step[0].links.pairs for step in (steps[-1], permuted(steps[-1], order))]
+    trust = [
+        each.matrix((found.confidence * each.there).unsqueeze(1))
+        for each, found in zip(pairs, (one, other), strict=True)
+    ]
+    assert torch.allclose(trust[1], trust[0][:, order][:, :, order], rtol=1e-8)
 
 
 def test_lengths_in_other_units_give_the_same_corrections() -> None:
@@ -160,9 +173,7 @@ def test_lengths_in_other_units_give_the_same_corrections() -> None:
     (one,) = corrections(network, (inputs, found, weight, shift))
     means, past = no_means(), network.start(inputs.fixed.shape, 3)
     scaled = Solution(c * found.position, c**2 * found.variance)
-    graph, _ = graph_inputs(
-        small, scaled, weight / c**2, c * shift, c * STD, means, max_offset(scaled)
-    )
+    graph, _ = graph_of((small, scaled, weight / c**2, c * shift), means, c * STD)
     other, _ = network(graph, past)
     assert torch.allclose(other.offset, c * one.offset, rtol=1e-7, atol=1e-9)
 
@@ -236,7 +247,7 @@ def test_the_receptive_field_in_time() -> None:
 
 def attention_of(step: Any, **chosen: Any) -> tuple[TopologicalAttention, Any, Tensor]:
     """A layer, a step's graph and W h for it."""
-    graph, _ = graph_inputs(*step, STD, no_means(), max_offset(step[1]))
+    graph, _ = graph_of(step)
     layer = TopologicalAttention(16, graph.vectors.shape[-1], 4, **chosen)
     mapped = torch.randn(2, N, 16, generator=torch.Generator().manual_seed(1)).double()
     return layer.double().requires_grad_(False), graph, mapped
@@ -244,10 +255,11 @@ def attention_of(step: Any, **chosen: Any) -> tuple[TopologicalAttention, Any, T
 
 def test_attention_is_a_mean_over_links() -> None:
     layer, graph, mapped = attention_of(step_of(7))
-    share = layer.attention(graph, mapped)
-    linked = graph.mask.any(-1)
+    share = graph.pairs.matrix(layer.attention(graph, mapped))
+    mask = graph.pairs.matrix(graph.pairs.there.double().unsqueeze(1)) > 0
+    linked = mask.any(-1)
     assert torch.allclose(share.sum(-1)[linked], torch.ones(int(linked.sum())).double())
-    assert (share[~graph.mask] == 0).all()
+    assert (share[~mask] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -268,28 +280,27 @@ def test_a_link_is_cut_whose_ends_part_quickly_and_that_is_doubted(
     weight[:, 5], weight[:, :, 5] = confidence * weight[:, 5], confidence * weight[:, :, 5]
     step = (replace(inputs, state=state), found, weight, shift)
     layer, graph, mapped = attention_of(step)
-    others = graph.mask.clone()
+    mask = inputs.links.mask
+    others = mask.clone()
     others[:, 5] = False
     to_it = others & (torch.arange(N) == 5)
-    share = layer.attention(graph, mapped)
+    share = graph.pairs.matrix(layer.attention(graph, mapped))
     assert to_it.any()
     assert bool((share[to_it] == 0).all()) == is_cut
-    assert (share[graph.mask & ~to_it & others] > 0).all()
+    assert (share[mask & ~to_it & others] > 0).all()
     keeping, _, _ = attention_of(step, cut=False)
-    assert (keeping.attention(graph, mapped)[graph.mask] > 0).all()
+    assert (graph.pairs.matrix(keeping.attention(graph, mapped))[mask] > 0).all()
 
 
 def test_information_and_pushed_displacements_are_sums_over_links() -> None:
     step = step_of(9)
-    graph, _ = graph_inputs(*step, STD, no_means(), max_offset(step[1]))
-    y = graph.position
-    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / graph.length.unsqueeze(-1)
-    blocks = torch.einsum("bij,bijx,bijy->bixy", graph.weight, unit, unit)
-    assert torch.allclose(
-        own_information(y, graph.weight, graph.length), blocks, rtol=1e-7, atol=1e-12
-    )
+    graph, _ = graph_of(step)
+    y, weight = graph.position, graph.pairs.matrix(graph.weight)
+    unit = (y.unsqueeze(2) - y.unsqueeze(1)) / lengths(y).unsqueeze(-1)
+    blocks = torch.einsum("bij,bijx,bijy->bixy", weight, unit, unit)
+    assert torch.allclose(own_information(y, graph.coupling), blocks, rtol=1e-7, atol=1e-12)
     v = torch.randn(2, N, 3, 4, generator=torch.Generator().manual_seed(3)).double()
-    pushed = torch.einsum("bij,bijx,bijy,bjyc->bixc", graph.weight, unit, unit, v)
+    pushed = torch.einsum("bij,bijx,bijy,bjyc->bixc", weight, unit, unit, v)
     assert torch.allclose(pushed_by_ranges(graph, v), graph.gain @ pushed, rtol=1e-6, atol=1e-9)
 
 

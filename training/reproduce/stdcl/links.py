@@ -16,6 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from agents.registry import make
+from agents.swarm.belief import StepInput
+from agents.swarm.confidence import Weights
 from agents.swarm.filter import SwarmFilter
 from coloc_env.geometry.walls import depth
 from training.evaluation.metrics import Flags, Floats
@@ -159,9 +161,11 @@ class _Weights:
         weights, variance = base.weights, base.std**2
         self.last: Floats = np.zeros((0, 0))
 
-        def recorded(*given: Any) -> tuple[Float64[Tensor, "B N N"], Float64[Tensor, "B N N"]]:
-            weight, shift = weights(*given)
-            self.last = variance * weight[0].numpy()
+        def recorded(y: Float64[Tensor, "B N d"], inputs: StepInput) -> Weights:
+            weight, shift = weights(y, inputs)
+            pairs = inputs.links.listed
+            whole = weight if pairs is None else pairs.matrix(weight.unsqueeze(1))
+            self.last = variance * whole[0].numpy()
             return weight, shift
 
-        base.weights = recorded  # type: ignore[method-assign, assignment]
+        base.weights = recorded  # type: ignore[method-assign]
