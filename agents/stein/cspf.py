@@ -6,6 +6,7 @@ Every UAV holds m particles, each a joint hypothesis of the team's poses relativ
 the holders into consensus (equation 21).
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -145,11 +146,11 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         window = self._remembered(belief.window, motion, dt, new)
         origin = torch.where(linked[..., :1], observation["reference"].double(), belief.origin)
         scale, active = self._scale(belief), links & links.mT
-        target = self._target(window, scale, shape[1], active)
+        targets = self._targets(window, scale, shape[1], active)
         x = self._predict(belief, motion, dt)
         edges = self._edges(belief, motion, dt)
         started = belief.started
-        for _ in range(self.iterations):
+        for target in targets:
             x, estimate, edges, started = self._iterate(x, edges, started, active, target)
         inliers = target.inliers(estimate)
         count = window.mask.sum(-1)
@@ -223,10 +224,11 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         std = (self.std[0], self.std[-1])
         return windows.insert(windows.propagate(self.poses, window, motion.moved, std), new)
 
-    def _target(
+    def _targets(
         self, window: MatchWindow, scale: Scale, agents: int, active: Bool[Tensor, "B H R"]
-    ) -> Target:
-        return MatchTarget(
+    ) -> Sequence[Target]:
+        """Each iteration's."""
+        target = MatchTarget(
             poses=self.poses,
             window=window,
             factors=factors(self.poses, window, scale, agents),
@@ -238,6 +240,7 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             across=self.across,
             literal=self.literal,
         )
+        return [target] * self.iterations
 
     def _speed(
         self,

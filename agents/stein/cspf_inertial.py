@@ -25,6 +25,7 @@ from coloc_env.sensors import Imu, RelativePose, Sensor
 
 _NUMBERS = 10  # of an increment, and of a state
 _BYTES = 4  # of a number
+_WIDE = 4.0  # times the noise of matches: see ``_targets``
 
 
 class InertialSteinFilter(SteinFilter):
@@ -112,21 +113,31 @@ class InertialSteinFilter(SteinFilter):
         assert isinstance(window, InertialWindow)
         return windows.insert(windows.propagate(window, motion, dt, self.noise), new, self.noise)
 
-    def _target(
+    def _targets(
         self, window: MatchWindow, scale: Scale, agents: int, active: Bool[Tensor, "B H R"]
-    ) -> InertialTarget:
+    ) -> list[InertialTarget]:
+        """Each iteration's: all but the last with matches of at least ``_WIDE`` times their noise,
+        so that those are not taken for wrong which a prediction over a gap has missed."""
         assert isinstance(window, InertialWindow)
-        return inertial_target(
-            window,
-            scale,
-            agents,
-            match=self.noise.match,
-            outliers=self.outliers,
-            volume=self.volume,
-            velocity_std=self.velocity_std,
-            uniform=tuple(self.uniform),
-            pull=self.pull,
+        match = self.noise.match
+        wide = Scale(
+            scale.position.clamp_min(_WIDE * match[0]), scale.turn.clamp_min(_WIDE * match[1])
         )
+        ahead, last = (
+            inertial_target(
+                window,
+                each,
+                agents,
+                match=match,
+                outliers=self.outliers,
+                volume=self.volume,
+                velocity_std=self.velocity_std,
+                uniform=tuple(self.uniform),
+                pull=self.pull,
+            )
+            for each in (wide, scale)
+        )
+        return [ahead] * (self.iterations - 1) + [last]
 
     def _speed(
         self,
