@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from agents.models import rotations
 from agents.models.measurements import (
     AnchorRanges,
     Block,
@@ -15,7 +16,6 @@ from agents.models.measurements import (
     UavRanges,
     per_state,
 )
-from agents.models import rotations
 from agents.models.process import Process
 from agents.particle.landmark_densities import (
     any_landmark_log_likelihood,
