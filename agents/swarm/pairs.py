@@ -37,8 +37,8 @@ class Pairs:
 
     def apart(self, x: Float[Tensor, "B N d"]) -> Float[Tensor, "B d E"]:
         """x_i − x_j of what UAVs have."""
-        i, j = self.own(x.mT).unbind(-2)
-        return i - j
+        i, j = self.ends.unbind(1)
+        return torch.stack([of.gather(1, i) - of.gather(1, j) for of in x.unbind(-1)], 1)
 
     def units(self, y: Float[Tensor, "B N d"]) -> tuple[Float[Tensor, "B d E"], Tensor]:
         """The unit vectors u_ij from j to i, and the lengths [B, E] of links (1e-9 at least)."""
@@ -49,16 +49,14 @@ class Pairs:
     def sums(self, x: Tensor) -> Tensor:
         """Σ_j x_ij at every UAV, [B, *s, N], of what links have at both ends, [B, *s, 2, E], or
         have alike, [B, *s, 1, E]."""
-        i, j = both(x).unbind(-2)
-        return self._added(i, j)
+        at_i, at_j = both(x).unbind(-2)
+        return self._at(0, at_i) + self._at(1, at_j)
 
     def along(self, strength: Tensor, unit: Float[Tensor, "B d E"]) -> Float[Tensor, "B N d"]:
         """Σ_j s_ij u_ij at every UAV, of strengths at both ends, [B, 2, E], or alike, [B, 1, E]."""
-        if strength.shape[1] == 1:
-            at_i = strength * unit
-            return self._added(at_i, -at_i).mT
-        at_i, at_j = (one.unsqueeze(1) * unit for one in strength.unbind(1))
-        return self._added(at_i, -at_j).mT
+        at_i = strength[:, :1] * unit
+        at_j = at_i if strength.shape[1] == 1 else strength[:, 1:] * unit
+        return (self._at(0, at_i) - self._at(1, at_j)).mT
 
     def largest(self, x: Float[Tensor, "B 2 E"]) -> Float[Tensor, "B N"]:
         """max_j x_ij at every UAV; −∞ without a link."""
@@ -94,11 +92,10 @@ class Pairs:
                 return label
             label = lower
 
-    def _added(self, at_i: Tensor, at_j: Tensor) -> Tensor:
-        total = at_i.new_zeros(*at_i.shape[:-1], self.n)
-        for end, one in zip(self.ends.unbind(1), (at_i, at_j), strict=True):
-            total = total.scatter_add(-1, _over(end, one), one)
-        return total
+    def _at(self, end: int, x: Tensor) -> Tensor:
+        """Sums at every UAV, [B, *s, N], of what links have at one end, [B, *s, E]."""
+        total = x.new_zeros(*x.shape[:-1], self.n)
+        return total.scatter_add(-1, _over(self.ends[:, end], x), x)
 
     @cached_property
     def _places(self) -> Int64[Tensor, "B 2 E"]:
