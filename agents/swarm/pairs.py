@@ -81,6 +81,18 @@ class Pairs:
         matrix.scatter_(1, self._places.flatten(1), both(x).flatten(1))
         return matrix.unflatten(1, (self.n, -1))
 
+    def laplacian(
+        self, weight: Float[Tensor, "B E"], index: Int64[Tensor, "M"]
+    ) -> Float[Tensor, "B M M"]:
+        """The rows and columns of the UAVs in ``index`` of Σ W_ij (e_i − e_j)(e_i − e_j)ᵀ."""
+        m, weight = len(index), weight.unsqueeze(1)
+        place = torch.full((self.n,), m, device=index.device)  # all others are one more
+        place[index] = torch.arange(m, device=index.device)
+        among = Pairs(place[self.ends], self.there, m + 1)
+        matrix = among.matrix(-weight)[:, :m, :m]
+        matrix.diagonal(dim1=-2, dim2=-1).add_(self.sums(weight)[:, index])
+        return matrix
+
     def components(self) -> Int64[Tensor, "B N"]:
         """The first UAV of the connected component of the network that each belongs to."""
         label = torch.arange(self.n, device=self.ends.device).expand(len(self.ends), -1)
