@@ -25,6 +25,7 @@ SHORT = {  # scenario: overrides that make it short
     "replay-miluv-v0": ["span=0:2"],
     "replay-mrclam-v0": ["span=0:4"],
     "replay-murp-v0": ["span=0:12"],
+    "replay-stein-euroc-team-v0": ["span=0:2"],
     "replay-stein-euroc-v0": ["span=0:3"],
     "replay-tiers-v0": ["span=0:4"],
     "replay-tuc-v0": ["span=0:4"],

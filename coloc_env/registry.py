@@ -117,6 +117,12 @@ class Registry(Mapping[str, Factory]):
             what = f"{self.kind} {name!r}: its options cannot be read"
             raise ValueError(f"{what}: {_words(error)}") from error
 
+    def module(self, name: str) -> str:
+        """The module that a name's factory is from; nothing is imported."""
+        if name in self._registered:
+            return self._registered[name].__module__
+        return self._references[name].partition(":")[0]
+
     def summary(self, name: str) -> str:
         """First paragraph of the docstring, in one line; read from the source where the module is
         not imported yet. Where that cannot be read, what is wrong, in brackets."""

@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate
+from agents.localizer import Estimate, Localizer
 from agents.stein import odometry
 from agents.stein.team import RelativeTeam
 from agents.tensorclasses import build
 from coloc_env.observation import Observation
 from coloc_env.options import PositiveCount
-from coloc_env.scenario import Believed
+from coloc_env.scenario import Believed, Inertial
 
 Robust = Literal["huber", "gnc", "none"]
 
@@ -29,9 +29,9 @@ _CLOSE = (0.5, 0.35)  # m, rad: matches that agree in the initial estimate
 
 
 class PoseGraphBelief(TensorClass):
-    """Each UAV's ``track`` by odometry over T steps, the M ``matches`` of each step with their
-    ``ends`` and ``mask``, the ``estimate`` relative to UAV 0 and the ``covariance`` of its position
-    in its body frame (m²); batch (B, N)."""
+    """Each UAV's ``track`` by odometry over T steps (or the means of its IMU, [T, 6]), the M
+    ``matches`` of each step with their ``ends`` and ``mask``, the ``estimate`` relative to UAV 0
+    and the ``covariance`` of its position in its body frame (m²); batch (B, N)."""
 
     track: Float64[Tensor, "B N T P"]
     ends: Int64[Tensor, "B N T M 2"]
@@ -76,6 +76,15 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
             raise ValueError("GTSAM is missing: pip install coloc-env[graph]") from error
         self.gtsam, self.robust, self.every = gtsam, robust, every
 
+    @classmethod
+    def for_team(cls, believed: Believed, **options: Any) -> Localizer[Any]:
+        """The graph; in a team that moves by its IMUs the one that has them as factors."""
+        if not isinstance(believed.process, Inertial):
+            return cls(believed, **options)
+        from agents.factor_graph.pose_graph_inertial import InertialPoseGraph
+
+        return InertialPoseGraph(believed, **options)
+
     def reset(self, observation: Observation) -> PoseGraphBelief:
         b, n = observation.batch_size
         poses, m = self.poses, self.matches.matches
@@ -98,15 +107,11 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
     def step(
         self, belief: PoseGraphBelief, observation: Observation
     ) -> tuple[PoseGraphBelief, Estimate]:
-        poses, m = self.poses, self.matches.matches
+        poses = self.poses
         dt = (belief.step > 0).double() * self.believed.arena.dt
         moved = odometry.increments(poses, observation, dt)
         before = belief.track[:, :, -1] if belief.track.shape[2] else belief.estimate
-        pose = observation["relative_poses"].double().unflatten(-1, (m, poses.size))
-        mask = (observation["relative_pose_mask"] > 0) & pose.isfinite().all(-1)
-        pose = torch.where(mask.unsqueeze(-1), pose, poses.identity(pose))
-        ends = observation["relative_pose_ends"].unflatten(-1, (m, 2))
-        ends = torch.where(mask.unsqueeze(-1), ends, 0.0).to(torch.int64)
+        ends, pose, mask = self._measured(observation)
 
         def append(steps: Tensor, new: Tensor) -> Tensor:
             return torch.cat((steps, new.unsqueeze(2)), 2)
@@ -130,12 +135,21 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
             after = after.replace(estimate=estimate, covariance=covariance)
         origin = observation["reference"].double()
         return after, self.world_estimate(
-            after.estimate, after.covariance, origin, observation, dt > 0
+            after.estimate, after.covariance, origin, odometry.speed(poses, observation, dt > 0)
         )
+
+    def _measured(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:
+        """The step's matches: their ends, poses, and which are there."""
+        m, poses = self.matches.matches, self.poses
+        pose = observation["relative_poses"].double().unflatten(-1, (m, poses.size))
+        mask = (observation["relative_pose_mask"] > 0) & pose.isfinite().all(-1)
+        pose = torch.where(mask.unsqueeze(-1), pose, poses.identity(pose))
+        ends = observation["relative_pose_ends"].unflatten(-1, (m, 2))
+        return torch.where(mask.unsqueeze(-1), ends, 0.0).to(torch.int64), pose, mask
 
     def team(self, belief: PoseGraphBelief) -> Float[Tensor, "B H N P"]:
         n = belief.step.shape[1]
-        return belief.estimate.unsqueeze(1).expand(-1, n, -1, -1)
+        return belief.estimate[..., : self.poses.size].unsqueeze(1).expand(-1, n, -1, -1)
 
     # ---------------------------------------------------------------- one world's graph
 
@@ -162,11 +176,7 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
                 key = uav * steps + k
                 graph.add(between(key, key + 1, self._to_gtsam(factors.odometry[uav, k]), odometry))
         known = graph.size()
-        d, turns = self.poses.dim, self.poses.dof - self.poses.dim
-        match = self._noise([self.matches.std] * d + [self.matches.turn_std] * turns)
-        if self.robust == "huber":
-            loss = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
-            match = gtsam.noiseModel.Robust.Create(loss, match)
+        match = self._match_noise()
         for i, j, k, pose in zip(
             factors.first, factors.second, factors.at, factors.pose, strict=True
         ):
@@ -176,7 +186,7 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
         estimate = torch.stack([self._from_gtsam(values, key) for key in keys])
         estimate = self.poses.between(estimate[:1], estimate)
         marginals = gtsam.Marginals(graph, values)
-        cut = slice(3, 6) if d == 3 else slice(0, 2)
+        cut = slice(3, 6) if self.poses.dim == 3 else slice(0, 2)
         covariance = [torch.tensor(marginals.marginalCovariance(key)[cut, cut]) for key in keys]
         return estimate, torch.stack(covariance).to(estimate.dtype)
 
@@ -246,6 +256,16 @@ class PoseGraph(RelativeTeam[PoseGraphBelief]):
             else:
                 placed[a] = poses.compose(placed[b], poses.inverse(step))
         return torch.stack([placed.get(j, placed[0]) for j in range(n)])
+
+    def _match_noise(self) -> Any:
+        """The noise model of matches, with Huber's loss if that is asked for."""
+        gtsam, d = self.gtsam, self.poses.dim
+        std = [self.matches.std] * d + [self.matches.turn_std] * (self.poses.dof - d)
+        match = self._noise(std)
+        if self.robust != "huber":
+            return match
+        loss = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+        return gtsam.noiseModel.Robust.Create(loss, match)
 
     def _noise(self, std: Sequence[float]) -> Any:
         """A diagonal noise model; GTSAM puts a rotation in space first."""

@@ -9,7 +9,7 @@ right. A sample holds over the ``dt`` that follows it.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from coloc_env.geometry import (
@@ -23,6 +23,7 @@ from coloc_env.geometry import (
     rotate_by,
     so3,
 )
+from coloc_env.observation import Observation
 from coloc_env.sensors import GRAVITY
 
 
@@ -110,6 +111,17 @@ def preintegrate(
         bias=bias,
         bias_jacobian=-effect.sum(-3),
     )
+
+
+def samples_in(
+    observation: Observation, dt: Float64[Tensor, "B N"]
+) -> tuple[Float64[Tensor, "B N S 6"], Float64[Tensor, "B N S"]]:
+    """The IMU's samples in a step of ``dt`` s, or their mean where there is only that, and for how
+    long each holds (s)."""
+    if "imu_samples" not in observation:
+        return observation["imu"].double().unsqueeze(-2), dt.unsqueeze(-1)
+    samples = observation["imu_samples"].double().unflatten(-1, (-1, 6))
+    return samples, observation["imu_held"].double() * (dt > 0).unsqueeze(-1)
 
 
 def predict(

@@ -110,7 +110,9 @@ class TeamParticleFilter(RelativeTeam[TeamCloud]):
             step=belief.step + 1,
         )
         origin = observation["reference"].double()
-        return after, self.world_estimate(estimate, spread, origin, observation, dt > 0)
+        return after, self.world_estimate(
+            estimate, spread, origin, odometry.speed(poses, observation, dt > 0)
+        )
 
     def team(self, belief: TeamCloud) -> Float[Tensor, "B H N P"]:
         n = belief.step.shape[1]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from agents.stein.estimate import States
 from coloc_env.geometry import Poses, Pulls
 
 
@@ -27,7 +28,7 @@ def penalty_steps(
 
 
 def dual_update(
-    poses: type[Poses],
+    poses: States,
     own: Float64[Tensor, "B H R N P"],
     received: Float64[Tensor, "B H R N P"],
     estimate: Float64[Tensor, "B H N P"],

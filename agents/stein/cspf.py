@@ -6,31 +6,29 @@ Every UAV holds m particles, each a joint hypothesis of the team's poses relativ
 the holders into consensus (equation 21).
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
-from agents.localizer import Estimate
+from agents.localizer import Estimate, Localizer
 from agents.particle.belief import normal, own_keys
 from agents.stein import consensus, odometry
 from agents.stein import match_window as windows
-from agents.stein.estimate import covariance, map_estimate
-from agents.stein.likelihood import Factors, Fit, Scale, factors, fit, outlier_level, residuals
-from agents.stein.match_window import MatchWindow
-from agents.stein.neighbourhood import fit_neighbours
+from agents.stein.estimate import States, map_estimate
+from agents.stein.likelihood import Scale, factors, outlier_level
+from agents.stein.match_window import Matches, MatchWindow
 from agents.stein.odometry import Motion, Tracks
+from agents.stein.target import MatchTarget, Pull, Target
 from agents.stein.team import RelativeTeam
-from agents.stein.update import kernel, stein_step
 from agents.tensorclasses import build
 from coloc_env import noise
-from coloc_env.geometry import Pulls
 from coloc_env.observation import Observation
 from coloc_env.options import Factor, OpenShare, PositiveCount, PositiveShare, Ratio, Share
-from coloc_env.scenario import Believed
+from coloc_env.scenario import Believed, Inertial
 
 Variant = Literal["settled", "neighbourhood", "paper_corrected", "paper"]
 
@@ -55,18 +53,6 @@ class SteinBelief(TensorClass):
     inliers: Float64[Tensor, "B H"]
     key: Int64[Tensor, "B H"]
     step: Int64[Tensor, "B H"]
-
-
-@dataclass(frozen=True)
-class _StepInput:
-    """What a step's iterations are computed from: the ``window`` and its ``factors``, the annealed
-    ``scale``, the outlier level ``beta`` and which edges are ``active`` in both directions."""
-
-    window: MatchWindow
-    factors: Factors
-    scale: Scale
-    beta: Float64[Tensor, "B H"]
-    active: Bool[Tensor, "B H R"]
 
 
 class SteinFilter(RelativeTeam[SteinBelief]):
@@ -116,7 +102,18 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         self.restart = 0.0 if literal else restart
         self.consensus, self.broadcast = consensus, broadcast
         self.literal, self.across = literal, variant != "settled"
-        self._parts = torch.tensor((self.poses.dim, self.poses.dof - self.poses.dim))
+        self.group: odometry.Group = self.poses
+        self.states: States = self.poses
+        self.pull = Pull(self.gamma, consensus, self.repulsion)
+
+    @classmethod
+    def for_team(cls, believed: Believed, **options: Any) -> Localizer[Any]:
+        """The filter; in a team that moves by its IMUs the one that pre-integrates them."""
+        if not isinstance(believed.process, Inertial):
+            return cls(believed, **options)
+        from agents.stein.cspf_inertial import InertialSteinFilter
+
+        return InertialSteinFilter(believed, **options)
 
     def reset(self, observation: Observation) -> SteinBelief:
         key, origin = own_keys(observation, self.seed), observation["reference"].double()
@@ -128,8 +125,8 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             estimate=estimate,
             edges=estimate.unsqueeze(2).expand(-1, -1, n, -1, -1).contiguous(),
             started=torch.zeros(b, n, n, dtype=torch.bool, device=key.device),
-            window=windows.empty(self.poses, key.shape, self.window, origin),
-            tracks=odometry.initial(self.poses, key.shape, origin),
+            window=self._nothing(key.shape, origin),
+            tracks=odometry.initial(self.group, key.shape, origin),
             origin=origin,
             annealed=torch.zeros_like(key),
             inliers=torch.ones_like(origin[..., 0]),
@@ -139,31 +136,23 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         )
 
     def step(self, belief: SteinBelief, observation: Observation) -> tuple[SteinBelief, Estimate]:
-        poses, shape = self.poses, belief.step.shape
+        shape = belief.step.shape
         links = observation["links"] > 0
         linked = links | torch.eye(shape[1], dtype=torch.bool, device=links.device)
         dt = (belief.step > 0).double() * self.believed.arena.dt
-        tracks, motion = odometry.exchange(poses, belief.tracks, observation, dt, linked)
-        window = windows.propagate(poses, belief.window, motion.pose, (self.std[0], self.std[-1]))
-        new = windows.observed_matches(poses, observation, linked, self.broadcast)
-        window = windows.insert(window, new)
+        increments = self._increments(observation, dt)
+        tracks, motion = odometry.exchange(self.group, belief.tracks, increments, dt, linked)
+        new = windows.observed_matches(self.poses, observation, linked, self.broadcast)
+        window = self._remembered(belief.window, motion, dt, new)
         origin = torch.where(linked[..., :1], observation["reference"].double(), belief.origin)
-        scale = self._scale(belief)
-        inputs = _StepInput(
-            window=window,
-            factors=factors(poses, window, scale, shape[1]),
-            scale=scale,
-            beta=outlier_level(poses, scale, self.outliers, self.volume),
-            active=links & links.mT,
-        )
-        x = self._predict(belief, motion)
-        edges = odometry.propagate(poses, belief.edges, motion.pose.unsqueeze(2))
+        scale, active = self._scale(belief), links & links.mT
+        targets = self._targets(window, scale, shape[1], active)
+        x = self._predict(belief, motion, dt)
+        edges = self._edges(belief, motion, dt)
         started = belief.started
-        for _ in range(self.iterations):
-            x, estimate, edges, started = self._iterate(x, edges, started, inputs)
-        inliers = residuals(
-            poses, estimate.unsqueeze(-2), window, inputs.factors, scale, inputs.beta
-        )[1][..., 0]
+        for target in targets:
+            x, estimate, edges, started = self._iterate(x, edges, started, active, target)
+        inliers = target.inliers(estimate)
         count = window.mask.sum(-1)
         share = inliers.sum(-1) / count.clamp_min(1)
         restart = (share < self.restart) & (count >= min(_MIN_MATCHES, self.window))
@@ -187,18 +176,22 @@ class SteinFilter(RelativeTeam[SteinBelief]):
             step=belief.step + 1,
         )
         own = torch.arange(shape[1], device=origin.device)
-        prior = origin.new_tensor(self.uniform)
-        whole = covariance(poses, estimate, window, inliers, inputs.factors, scale, prior)
-        position = whole[..., : poses.dim, : poses.dim]
         return after, self.world_estimate(
-            estimate[:, own, own], position, origin, observation, dt > 0
+            estimate[:, own, own, : self.poses.size],
+            target.position_covariance(estimate, inliers),
+            origin,
+            self._speed(belief, after, observation, dt),
         )
 
     def team(self, belief: SteinBelief) -> Float[Tensor, "B H N P"]:
-        return belief.estimate
+        return belief.estimate[..., : self.poses.size]
 
     def diagnostics(self, belief: SteinBelief) -> dict[str, Float[Tensor, "B N"]]:
         return {"inlier_share": belief.inliers}
+
+    def _nothing(self, shape: torch.Size, like: Tensor) -> MatchWindow:
+        """A window before any match."""
+        return windows.empty(self.poses, shape, self.window, like)
 
     def _scale(self, belief: SteinBelief) -> Scale:
         """The annealed scale; as printed, that of the sensor from the start."""
@@ -212,60 +205,91 @@ class SteinFilter(RelativeTeam[SteinBelief]):
         first = torch.arange(key.shape[1], device=key.device) == 0
         return torch.where(first[:, None, None], self.poses.identity(x), x)
 
-    def _predict(self, belief: SteinBelief, motion: Motion) -> Float64[Tensor, "B H N m P"]:
+    def _increments(
+        self, observation: Observation, dt: Float64[Tensor, "B N"]
+    ) -> Float64[Tensor, "B N P"]:
+        """Each UAV's own motion in a step of ``dt`` s."""
+        return odometry.increments(self.poses, observation, dt)
+
+    def _edges(
+        self, belief: SteinBelief, motion: Motion, dt: Float64[Tensor, "B H"]
+    ) -> Float64[Tensor, "B H R N P"]:
+        """The dual variables, which move as the UAVs do."""
+        return odometry.propagate(self.poses, belief.edges, motion.moved.unsqueeze(2))
+
+    def _remembered(
+        self, window: MatchWindow, motion: Motion, dt: Float64[Tensor, "B H"], new: Matches
+    ) -> MatchWindow:
+        """The window's matches as they are now, and the ``new`` ones."""
+        std = (self.std[0], self.std[-1])
+        return windows.insert(windows.propagate(self.poses, window, motion.moved, std), new)
+
+    def _targets(
+        self, window: MatchWindow, scale: Scale, agents: int, active: Bool[Tensor, "B H R"]
+    ) -> Sequence[Target]:
+        """Each iteration's."""
+        target = MatchTarget(
+            poses=self.poses,
+            window=window,
+            factors=factors(self.poses, window, scale, agents),
+            scale=scale,
+            beta=outlier_level(self.poses, scale, self.outliers, self.volume),
+            active=active,
+            uniform=tuple(self.uniform),
+            pull=self.pull,
+            across=self.across,
+            literal=self.literal,
+        )
+        return [target] * self.iterations
+
+    def _speed(
+        self,
+        before: SteinBelief,
+        after: SteinBelief,
+        observation: Observation,
+        dt: Float64[Tensor, "B N"],
+    ) -> Float64[Tensor, "B N d"]:
+        """Each UAV's velocity in its own body frame, m/s."""
+        return odometry.speed(self.poses, observation, dt > 0)
+
+    def _drawn(self, belief: SteinBelief, size: int) -> Float64[Tensor, "B H m N D"]:
+        """Standard normal numbers for ``size`` errors of each agent's motion in each particle."""
+        n, key = belief.step.shape[1], noise.fold(belief.key, belief.step)
+        draws = normal(key, "cspf.step", n * size, self.particles).double()
+        return draws.unflatten(-1, (n, -1))
+
+    def _predict(
+        self, belief: SteinBelief, motion: Motion, dt: Float64[Tensor, "B H"]
+    ) -> Float64[Tensor, "B H N m P"]:
         """x_j ← D_0⁻¹ x_j D_j (equation 29), each particle with noise of its own on every D; a
         single one without noise."""
-        poses, n = self.poses, belief.step.shape[1]
-        d = motion.pose.unsqueeze(2)
+        d = motion.moved.unsqueeze(2)
         if self.particles > 1 and any(self.std):
-            key = noise.fold(belief.key, belief.step)
-            draws = normal(key, "cspf.step", n * poses.dof, self.particles).double()
-            draws = draws.unflatten(-1, (n, -1)) * draws.new_tensor(self.std)
-            d = poses.plus(d, draws * motion.steps.to(torch.float32).sqrt()[:, :, None, :, None])
-        return odometry.propagate(poses, belief.x.transpose(2, 3), d).transpose(2, 3)
+            draws = self._drawn(belief, self.poses.dof)
+            draws = draws * draws.new_tensor(self.std)
+            spread = motion.steps.to(torch.float32).sqrt()[:, :, None, :, None]
+            d = self.poses.plus(d, draws * spread)
+        return odometry.propagate(self.poses, belief.x.transpose(2, 3), d).transpose(2, 3)
 
     def _iterate(
         self,
         x: Float64[Tensor, "B H N m P"],
         edges: Float64[Tensor, "B H R N P"],
         started: Bool[Tensor, "B H R"],
-        inputs: _StepInput,
+        linked: Bool[Tensor, "B H R"],
+        target: Target,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Lines 7 to 9 of Algorithm 1: particles by equation 26, MAP estimate, dual variables by
-        equation 21."""
-        poses, n = self.poses, x.shape[2]
-        active = started & started.mT & inputs.active
+        equation 21; ``linked``: edges in both directions."""
+        active = started & started.mT & linked
         received = edges.transpose(1, 2)
-        target = self._target(x, inputs)
-        steps, log_density = target.steps, target.log_density
-        if self.consensus:
-            penalty = consensus.penalty_steps(poses, x, received, active)
-            steps = steps + self.gamma * penalty.tangent
-            log_density = log_density - 0.5 * self.gamma * _in_units(penalty, inputs.scale)
-        weight = target.weight + self.gamma * (n - 1)  # H, block-diagonal
-        near = kernel(poses, x, inputs.scale)
-        steps = steps / weight.repeat_interleave(self._parts.to(x.device), -1)  # H⁻¹ b, eq. 17
-        phi = stein_step(near, steps.transpose(2, 3), weight.transpose(2, 3), self.repulsion)
-        moved = poses.plus(x, self.pace * phi.transpose(2, 3))  # x exp(a φ*), eq. 15
+        found = target.direction(x, received, active)
+        moved = self.states.plus(x, self.pace * found.phi)  # x exp(a φ*), eq. 15
         x = torch.cat((x[:, :, :1], moved[:, :, 1:]), 2)
-        estimate = map_estimate(poses, x, log_density, near.k)
+        estimate = map_estimate(self.states, x, found.log_density, found.k)
         if self.consensus:
-            updated = consensus.dual_update(poses, edges, received, estimate, self.eta)
-            first = inputs.active & ~started
+            updated = consensus.dual_update(self.states, edges, received, estimate, self.eta)
+            first = linked & ~started
             edges = torch.where(active[..., None, None], updated, edges)
             edges = torch.where(first[..., None, None], estimate.unsqueeze(2), edges)
-        return x, estimate, edges, started | inputs.active
-
-    def _target(self, x: Float64[Tensor, "B H N m P"], inputs: _StepInput) -> Fit:
-        """The target's Gauss–Newton steps: by joint residuals, or by equation 16."""
-        if not self.across:
-            return fit(self.poses, x, inputs.window, inputs.factors, inputs.scale, inputs.beta)
-        beta = torch.zeros_like(inputs.beta) if self.literal else inputs.beta
-        return fit_neighbours(self.poses, x, inputs.window, inputs.scale, beta, inputs.active)
-
-
-def _in_units(penalty: Pulls, scale: Scale) -> Float64[Tensor, "B H m"]:
-    """Squared distances to the other ends' dual variables, in units of the scale, summed over
-    agents."""
-    position = penalty.position.sum(2) / scale.position.square().unsqueeze(-1)
-    return position + penalty.turn.sum(2) / scale.turn.square().unsqueeze(-1)
+        return x, estimate, edges, started | linked

@@ -19,8 +19,11 @@ class Manifold(NamedTuple):
     minus: Callable[[Tensor, Tensor], Tensor]
 
 
+States = type[Poses] | Manifold
+
+
 def map_estimate(
-    poses: type[Poses] | Manifold,
+    poses: States,
     x: Float64[Tensor, "B H N m P"],
     log_density: Float64[Tensor, "B H m"],
     k: Float64[Tensor, "B H m m"],

@@ -100,6 +100,13 @@ def propagate(
 
 def insert(window: MatchWindow, new: Matches) -> MatchWindow:
     """The window with the new matches in place of the oldest ones."""
+    added = torch.zeros_like(new.pose[..., :2])
+    return build(MatchWindow, window.cursor.shape, **inserted(window, new, added_variance=added))
+
+
+def inserted(window: MatchWindow, new: Matches, **more: Tensor) -> dict[str, Tensor]:
+    """The window's entries with the new matches in place of the oldest ones; ``more``: what is kept
+    of each new match beside it."""
     size = window.mask.shape[-1]
     count = new.mask.to(torch.int64).cumsum(-1)
     slot = torch.where(new.mask, (window.cursor.unsqueeze(-1) + count - 1) % size, size)
@@ -110,16 +117,8 @@ def insert(window: MatchWindow, new: Matches) -> MatchWindow:
         spare = torch.cat((old, old[:, :, :1]), 2)
         return spare.scatter(2, index, values)[:, :, :size]
 
-    return build(
-        MatchWindow,
-        window.cursor.shape,
-        first=put(window.first, new.first),
-        second=put(window.second, new.second),
-        pose=put(window.pose, new.pose),
-        added_variance=put(window.added_variance, torch.zeros_like(new.pose[..., :2])),
-        mask=put(window.mask, new.mask),
-        cursor=(window.cursor + count[..., -1]) % size,
-    )
+    found = {name: put(window.get(name), values) for name, values in (vars(new) | more).items()}
+    return found | {"cursor": (window.cursor + count[..., -1]) % size}
 
 
 def agents_of(

@@ -1,4 +1,5 @@
-"""Odometry: integrated by each UAV, and sent to the holders that it has links to."""
+"""Motion: integrated by each UAV, by odometry or (see ``galilean``) by its IMU, and sent to the
+holders that it has links to."""
 
 from dataclasses import dataclass
 
@@ -7,13 +8,16 @@ from jaxtyping import Bool, Float64, Int64
 from tensordict import TensorClass
 from torch import Tensor
 
+from agents.stein.galilean import Galilean
 from agents.tensorclasses import build
 from coloc_env.geometry import Poses
 from coloc_env.observation import Observation
 
+Group = type[Poses] | type[Galilean]
+
 
 class Tracks(TensorClass):
-    """``own``: each UAV's pose by its odometry alone, relative to its first one; ``received``: what
+    """``own``: each UAV's motion since the start by its odometry or IMU alone; ``received``: what
     each holder received of agents' own tracks last, ``age`` steps ago; batch (B, H)."""
 
     own: Float64[Tensor, "B H P"]
@@ -23,17 +27,17 @@ class Tracks(TensorClass):
 
 @dataclass(frozen=True)
 class Motion:
-    """``pose``: agents' motion D_j since a holder last received it (the identity for those without
+    """``moved``: agents' motion D_j since a holder last received it (the identity for those without
     a link now), over so many ``steps``."""
 
-    pose: Float64[Tensor, "B H N P"]
+    moved: Float64[Tensor, "B H N P"]
     steps: Int64[Tensor, "B H N"]
 
 
-def initial(poses: type[Poses], shape: torch.Size, like: Tensor) -> Tracks:
+def initial(group: Group, shape: torch.Size, like: Tensor) -> Tracks:
     """Tracks before the first step."""
     b, n = shape
-    start = poses.identity(like)
+    start = group.identity(like)
     return build(
         Tracks,
         shape,
@@ -44,19 +48,19 @@ def initial(poses: type[Poses], shape: torch.Size, like: Tensor) -> Tracks:
 
 
 def exchange(
-    poses: type[Poses],
+    group: Group,
     tracks: Tracks,
-    observation: Observation,
+    increments: Float64[Tensor, "B N P"],
     dt: Float64[Tensor, "B H"],
     linked: Bool[Tensor, "B H N"],
 ) -> tuple[Tracks, Motion]:
-    """The tracks after a step of ``dt`` s, and the motion that holders receive from agents they
-    have a link to (themselves included)."""
-    own = poses.compose(tracks.own, increments(poses, observation, dt))
+    """The tracks after a step of ``dt`` s in which UAVs moved by ``increments``, and the motion
+    that holders receive from agents they have a link to (themselves included)."""
+    own = group.compose(tracks.own, increments)
     sent = own.unsqueeze(1).expand_as(tracks.received)
     row = linked.unsqueeze(-1)
     age = tracks.age + (dt > 0).unsqueeze(-1)
-    motion = torch.where(row, poses.between(tracks.received, sent), poses.identity(own))
+    motion = torch.where(row, group.between(tracks.received, sent), group.identity(own))
     after = build(
         Tracks,
         tracks.batch_size,
@@ -77,6 +81,14 @@ def increments(
     shift, turn = moved[..., : poses.dim], moved[..., poses.dim :]
     rotation = poses.split(poses.exp(torch.cat((torch.zeros_like(shift), turn), -1)))[1]
     return torch.cat((shift, rotation), -1)
+
+
+def speed(
+    poses: type[Poses], observation: Observation, moved: Bool[Tensor, "B N"]
+) -> Float64[Tensor, "B N d"]:
+    """The velocity by odometry (m/s, body frame); 0 before UAVs have ``moved``."""
+    measured = observation["odometry"][..., : poses.dim].double()
+    return torch.where(moved.unsqueeze(-1), measured, 0.0)
 
 
 def propagate(

@@ -174,13 +174,8 @@ class SteinViFilter(Localizer[SteinViBelief]):
     def _window(self, belief: SteinViBelief, observation: Observation) -> Preintegrated:
         """The step's samples, or their mean where there is only that, pre-integrated for all
         particles [B, N, 1] without the estimate's bias; over no time in the first step."""
-        if "imu_samples" in observation:
-            held = observation["imu_held"].double()
-            samples = observation["imu_samples"].double().unflatten(-1, (-1, 6))
-        else:
-            samples = observation["imu"].double().unsqueeze(-2)
-            held = torch.full_like(samples[..., 0], self.process.dt)
-        held = held * (belief.step > 0).unsqueeze(-1)
+        dt = (belief.step > 0).double() * self.process.dt
+        samples, held = preintegration.samples_in(observation, dt)
         whiter = held.shape[-1] ** 0.5  # the mean over a step is less noisy than a sample
         window = preintegration.preintegrate(
             samples.unsqueeze(2),

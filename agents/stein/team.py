@@ -1,10 +1,10 @@
 """The base of localizers of relative poses: beliefs, initial poses, and world estimates."""
 
 import math
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from agents.errors import NotServed
@@ -13,9 +13,8 @@ from agents.particle.belief import normal, uniform
 from agents.stein.likelihood import Scale
 from agents.tensorclasses import build
 from coloc_env.geometry import poses_in, rotate, rotation_matrix
-from coloc_env.observation import Observation
 from coloc_env.scenario import Believed
-from coloc_env.sensors import Odometry, Reference, RelativePose
+from coloc_env.sensors import Odometry, Reference, RelativePose, Sensor
 
 _START = (5.0, 0.5 * math.pi)  # m, rad: initial standard deviations of matches
 _KNOWN = 1e-6  # m²: variance of the position of UAV 0, which is the reference
@@ -26,28 +25,33 @@ B = TypeVar("B")
 class RelativeTeam(Localizer[B]):
     """Base of localizers of teams that measure relative poses; ``outliers``: share of them that is
     believed to be wrong, uniform over the arena and all rotations. ValueError without such a
-    sensor, without odometry, or in a team with more UAVs than slots."""
+    sensor, without odometry (or what else they are ``moved_by``), or in a team with more UAVs than
+    slots."""
 
-    serves = (RelativePose, Odometry)
+    serves: ClassVar[tuple[type[Sensor], ...]] = (RelativePose, Odometry)
+    moved_by: ClassVar[type[Sensor]] = Odometry
 
     def __init__(self, believed: Believed, outliers: float, anneal: float) -> None:
         super().__init__(believed)
         arena = believed.arena
-        matches, odometry = believed.sensor(RelativePose), believed.sensor(Odometry)
-        if matches is None or odometry is None or believed.sensor(Reference) is None:
-            raise NotServed("a team with relative poses, odometry and a reference is needed")
+        matches, moved_by = believed.sensor(RelativePose), believed.sensor(self.moved_by)
+        if matches is None or moved_by is None or believed.sensor(Reference) is None:
+            words = self.moved_by.__name__.lower()
+            raise NotServed(f"a team with relative poses, {words} and a reference is needed")
         if believed.slots < arena.n_uavs:
             raise NotServed(f"a team of {arena.n_uavs} needs as many slots, not {believed.slots}")
-        self.poses, self.matches, self.odometry = poses_in(arena.dim), matches, odometry
+        self.poses, self.matches = poses_in(arena.dim), matches
         self.outliers, self.anneal = outliers, anneal
         sides = [b - a for a, b in zip(arena.low, arena.high, strict=True)]
         turns = self.poses.dof - arena.dim
         self.volume = math.prod(sides) * (8 * math.pi**2 if turns == 3 else 2 * math.pi)
         self.uniform = [s * s / 12 for s in sides] + [math.pi**2 / 3] * turns
-        self.std = [
-            float(s) * arena.dt
-            for s in odometry.std(torch.zeros(self.poses.dof, dtype=torch.float64))
-        ]
+        self.std = [size * arena.dt for size in self._noise_of(moved_by)]
+
+    def _noise_of(self, sensor: Sensor) -> list[float]:
+        """Standard deviations of what UAVs are moved by, along each tangent."""
+        assert isinstance(sensor, Odometry)
+        return sensor.std(torch.zeros(self.poses.dof, dtype=torch.float64)).tolist()
 
     @property
     def exchanges(self) -> bool:
@@ -85,12 +89,10 @@ class RelativeTeam(Localizer[B]):
         own: Float64[Tensor, "B N P"],
         covariance: Float64[Tensor, "B N d d"],
         origin: Float64[Tensor, "B N P"],
-        observation: Observation,
-        moved: Bool[Tensor, "B N"],
+        speed: Float64[Tensor, "B N d"],
     ) -> Estimate:
-        """Each UAV's estimate of itself (relative to UAV 0, at ``origin``; covariance in its own
-        body frame) in the world frame, its velocity by odometry (0 in the first step, before it
-        has ``moved``)."""
+        """Each UAV's estimate of itself (relative to UAV 0, at ``origin``; covariance and velocity
+        ``speed``, m/s, in its own body frame) in the world frame."""
         world = self.poses.compose(origin, own)
         position, attitude = self.poses.split(world)
         rotation = rotation_matrix(attitude)
@@ -98,11 +100,10 @@ class RelativeTeam(Localizer[B]):
         covariance = 0.5 * (covariance + covariance.mT)
         eye = torch.eye(self.poses.dim, dtype=covariance.dtype, device=covariance.device)
         first = (torch.arange(covariance.shape[1], device=covariance.device) == 0)[:, None, None]
-        speed = observation["odometry"][..., : self.poses.dim].double()
         return build(
             Estimate,
             own.shape[:2],
             position=position,
-            velocity=torch.where(moved.unsqueeze(-1), rotate(attitude, speed), 0.0),
+            velocity=rotate(attitude, speed),
             covariance=torch.where(first, _KNOWN * eye, covariance),
         )

@@ -58,18 +58,24 @@ def stein_step(
     """
     rotation, d = near.rotation, near.position.shape[-1]
     total = near.k.sum(-1)
-    gradient = total[..., None, None] * near.position - _weighted_sum(near.k, near.position)
-    turned = rotation.mT @ _weighted_sum(near.k, rotation)
-    push = (_to_body(rotation, gradient), -_axis(turned))  # h² Σ_r ∇k_lr
+    push = repulsions(near)
     parts = []
     for part, moved in enumerate((steps[..., :d], steps[..., d:])):
         planar = part == 1 and d == 2  # a rotation in the plane is the same in any frame
-        shared = moved if planar else _to_world(rotation, moved)
+        shared = moved if planar else to_world(rotation, moved)
         pull = _weighted_sum(near.k, shared)
-        pull = pull if planar else _to_body(rotation, pull)
+        pull = pull if planar else to_body(rotation, pull)
         away = repulsion / (near.bandwidth[..., None, None] * information[..., part])
         parts.append((pull + away.unsqueeze(-1) * push[part]) / total[..., None, None])
     return torch.cat(parts, -1)
+
+
+def repulsions(near: Kernel) -> tuple[Float64[Tensor, "B H m N d"], Float64[Tensor, "B H m N t"]]:
+    """h² Σ_r ∇k_lr of positions and of rotations, in units of the scale, in body frames."""
+    total = near.k.sum(-1)
+    gradient = total[..., None, None] * near.position - _weighted_sum(near.k, near.position)
+    turned = near.rotation.mT @ _weighted_sum(near.k, near.rotation)
+    return to_body(near.rotation, gradient), -_axis(turned)
 
 
 def mean_over(near: Kernel, values: Float64[Tensor, "B H m E"]) -> Float64[Tensor, "B H m E"]:
@@ -82,12 +88,12 @@ def _weighted_sum(k: Float64[Tensor, "B H m m"], values: Float64[Tensor, "B H m 
     return (k @ values.flatten(3)).unflatten(-1, values.shape[3:])
 
 
-def _to_world(rotation: Tensor, v: Tensor) -> Tensor:
+def to_world(rotation: Tensor, v: Tensor) -> Tensor:
     """Body-frame vectors in the common frame."""
     return (rotation * v.unsqueeze(-2)).sum(-1)
 
 
-def _to_body(rotation: Tensor, v: Tensor) -> Tensor:
+def to_body(rotation: Tensor, v: Tensor) -> Tensor:
     """Vectors of the common frame in body frames."""
     return (rotation * v.unsqueeze(-1)).sum(-2)
 

@@ -176,7 +176,7 @@ def _about_reach(recording: Recording) -> list[tuple[int, str]]:
     """Robots whose place nothing shows, and maps that leave a mirror image."""
     fixed = {
         "anchor_ranges", "landmark_bearings", "landmark_vectors", "position_fix", "tdoa",
-        "rssi", "light", "ultrasonic",
+        "rssi", "light", "ultrasonic", *(("magnetometer",) if recording.magnetic_map else ()),
     } & recording.streams.keys()  # fmt: skip
     reached = {
         robot

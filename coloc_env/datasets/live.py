@@ -49,6 +49,7 @@ _COLUMNS = {
     "uav_rssi": ("robot", "strength"),
     "light": ("lamp", "intensity", "x", "y", "z"),
     "ultrasonic": BEAMS,
+    "magnetometer": ("x", "y", "z"),
     "height": ("height",),
     "position_fix": ("x", "y", "z"),
 }

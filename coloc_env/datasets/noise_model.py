@@ -152,11 +152,12 @@ class CompassModel:
 @dataclass(frozen=True)
 class StrengthModel:
     """Signal strengths: ``power`` dBm at 1 m, less 10 ``exponent`` dB for each tenfold distance,
-    ``std`` dB."""
+    ``wall_loss`` for each wall between, ``std`` dB."""
 
     std: float = 4.0
     power: float = -40.0
     exponent: float = 2.2
+    wall_loss: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,18 @@ class EchoModel:
 
     std: float = 0.03
     reach: float = 4.0
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """Magnetic fields by a map: ``std`` µT; the map's error ``map_std`` µT, which lasts
+    ``map_time`` s; the field varies by ``anomaly_std`` µT over ``length`` m."""
+
+    std: float = 0.5
+    map_std: float = 0.5
+    map_time: float = 1.0
+    anomaly_std: float = 5.0
+    length: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -212,6 +225,7 @@ class NoiseModel:
     uav_rssi: StrengthModel = StrengthModel()
     light: LightModel = LightModel()
     ultrasonic: EchoModel = EchoModel()
+    magnetometer: FieldModel = FieldModel()
     height: HeightModel = HeightModel()
     position_fix: FixModel = FixModel()
     anchors: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -293,14 +307,15 @@ def _built(
                 file.fail(at, f"{value:g} is not 0 or more")
             if abs(value) > 1e6 or (name == "delay" and abs(value) > 60):
                 file.fail(at, f"{value:g} is beyond all measure")
-            if name == "drift_time" and value == 0:
-                file.fail(at, "0 is no time")
+            if name in _POSITIVE and value == 0:
+                file.fail(at, f"0 is no {_POSITIVE[name]}")
             if name in ("scale", "turn_scale") and not 0.01 < value < 100:
                 file.fail(at, f"{value:g} is no scale from 0.01 to 100")
             found[name] = value
     return kind(**found)
 
 
+_POSITIVE = {"drift_time": "time", "map_time": "time", "length": "length"}
 _INNER: dict[type, type] = {
     RangeModel: LinkModel,
     BearingModel: SightingBias,

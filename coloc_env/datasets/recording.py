@@ -95,6 +95,19 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
+class MagneticMap:
+    """A magnetic field at the nodes of an even grid.
+
+    Attributes:
+        axes: coordinates of the nodes along x, y and z, metres, world frame, increasing.
+        field: [X, Y, Z, 3] tesla, world frame.
+    """
+
+    axes: tuple[Floats, Floats, Floats]
+    field: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Recording:
     """One recorded experiment of N robots in d dimensions, on one clock.
 
@@ -133,6 +146,8 @@ class Recording:
             tags, rows of NaN where a robot has fewer than K.
         places: what else is on the map, name to [d] metres, by kind: ``lamps``,
             ``access_points``, and the ``low`` and ``high`` corner of a ``room``.
+        walls: name to [2, d] metres: the low and the high corner of a solid box.
+        magnetic_map: the magnetic field, None where it is not known.
         source: citation and licence.
         origin: [d] metres: where the origin of all that stands here is in the world frame that was
             recorded.
@@ -166,6 +181,8 @@ class Recording:
     points: tuple[Table, ...] = ()
     start: Floats = field(default_factory=lambda: np.empty((0, 0)))
     places: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    walls: Mapping[str, Floats] = field(default_factory=dict)
+    magnetic_map: MagneticMap | None = None
 
     @property
     def tracked(self) -> bool:
@@ -196,6 +213,10 @@ class Recording:
                 if place.shape != (self.dim,):
                     raise ValueError(f"Recording.places: {kind} {name} has shape {place.shape}")
                 check_places(f"Recording.places: {kind} {name}", place)
+        for name, corners in self.walls.items():
+            if corners.shape != (2, self.dim):
+                raise ValueError(f"Recording.walls: {name} has shape {corners.shape}")
+            check_places(f"Recording.walls: {name}", corners)
         if self.tags.ndim != 3 or self.tags.shape[::2] != (robots, self.dim):
             raise ValueError(f"Recording.tags has shape {self.tags.shape}, not [{robots}, K, d]")
 
@@ -238,7 +259,16 @@ def near_origin(recording: Recording) -> Recording:
             kind: {name: place - origin for name, place in places.items()}
             for kind, places in recording.places.items()
         },
+        walls={name: corners - origin for name, corners in recording.walls.items()},
+        magnetic_map=_moved(recording.magnetic_map, origin),
     )
+
+
+def _moved(known: MagneticMap | None, origin: Floats) -> MagneticMap | None:
+    if known is None:
+        return None
+    x, y, z = (axis - start for axis, start in zip(known.axes, origin, strict=True))
+    return replace(known, axes=(x, y, z))
 
 
 def _shifted(tables: tuple[Table, ...], origin: Floats) -> tuple[Table, ...]:

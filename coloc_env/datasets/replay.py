@@ -87,6 +87,7 @@ def arena_of(recording: Recording, grid: Grid, margin: float) -> Arena:
     points = [track.position for track in recording.truth]
     points += [p for p in (recording.landmarks, recording.anchors) if len(p)]
     points += [place[None] for places in recording.places.values() for place in places.values()]
+    points += recording.walls.values()
     points += [table.values for table in (*recording.points, *recording.streams.get(_FIX, ()))]
     if len(recording.start):
         points.append(recording.start[~np.isnan(recording.start[:, :dim]).any(1), :dim])

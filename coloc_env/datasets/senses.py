@@ -1,4 +1,4 @@
-"""Recorded headings, signal strengths, lamps and distances to walls, as series by step."""
+"""Recorded headings, strengths, lamps, distances to walls and fields, as series by step."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,12 +7,15 @@ import numpy as np
 import torch
 
 from coloc_env.datasets.grid import Grid, last_on
-from coloc_env.datasets.noise_model import NoiseModel, StrengthModel
-from coloc_env.datasets.recording import Floats, Recording
+from coloc_env.datasets.noise_model import FieldModel, NoiseModel, StrengthModel
+from coloc_env.datasets.recording import Floats, MagneticMap, Recording
 from coloc_env.datasets.replay import as_series, dropped_of, newest, once
+from coloc_env.motion import Box
 from coloc_env.sensors import (
     Compass,
+    FieldMap,
     Light,
+    Magnetic,
     PathLoss,
     RecordedSensor,
     Rssi,
@@ -22,20 +25,21 @@ from coloc_env.sensors import (
 )
 
 Read = Callable[[Recording, Grid, Any], RecordedSensor]
+_MICRO = 1e6  # µT in a tesla
 _FAR = 1e4  # m: what was seen was near enough
 
 
 def believed_senses(recording: Recording, model: NoiseModel) -> dict[str, tuple[Read, Sensor]]:
     """What reads each of these streams that the recording has, and the belief about its sensor."""
     room = tuple(recording.places.get("room", {}).values())
-    own, echo = model.light, model.ultrasonic
+    own, echo, walls = model.light, model.ultrasonic, _walls(recording)
     made: dict[str, tuple[Read, Callable[[], Sensor]]] = {
         "compass": (recorded_compass, lambda: Compass(model.compass.std)),
         "rssi": (
             recorded_strengths,
-            lambda: Rssi(_places(recording, "access_points"), _loss(model.rssi)),
+            lambda: Rssi(_places(recording, "access_points"), _loss(model.rssi, walls)),
         ),
-        "uav_rssi": (recorded_uav_strengths, lambda: UavRssi(_loss(model.uav_rssi))),
+        "uav_rssi": (recorded_uav_strengths, lambda: UavRssi(_loss(model.uav_rssi, walls))),
         "light": (
             recorded_light,
             lambda: Light(
@@ -46,9 +50,14 @@ def believed_senses(recording: Recording, model: NoiseModel) -> dict[str, tuple[
         ),
         "ultrasonic": (
             recorded_echoes,
-            lambda: Ultrasonic((_tuple(room[0]), _tuple(room[1])), echo.std, echo.reach, 0.0),
+            lambda: Ultrasonic(
+                (_tuple(room[0]), _tuple(room[1])), echo.std, echo.reach, 0.0, walls
+            ),
         ),
     }
+    if recording.magnetic_map is not None:
+        known = recording.magnetic_map
+        made["magnetometer"] = (recorded_field, lambda: _surveyed(known, model.magnetometer))
     return {
         stream: (read, believed())
         for stream, (read, believed) in made.items()
@@ -111,6 +120,27 @@ def recorded_echoes(recording: Recording, grid: Grid, sensor: Ultrasonic) -> Rec
     return RecordedSensor(sensor, leaves, dropped=dropped_of(recording, "ultrasonic"))
 
 
+def recorded_field(recording: Recording, grid: Grid, sensor: Magnetic) -> RecordedSensor:
+    """Leaves ``magnetic`` (µT) and ``magnetic_mask``: the newest sample of each step."""
+    found = [last_on(grid, table) for table in recording.streams["magnetometer"]]
+    leaves = {
+        "magnetic": as_series([_MICRO * seen for seen, _ in found]),
+        "magnetic_mask": as_series([there[:, None] for _, there in found]),
+    }
+    return RecordedSensor(sensor, leaves, dropped=dropped_of(recording, "magnetometer"))
+
+
+def _surveyed(known: MagneticMap, model: FieldModel) -> Magnetic:
+    """The belief about a magnetometer, with a map."""
+    x, y, z = known.axes
+    low, high = ((float(x[i]), float(y[i]), float(z[i])) for i in (0, -1))
+    dx, dy, dz = (float(np.diff(axis).mean()) if len(axis) > 1 else 1.0 for axis in known.axes)
+    values = torch.from_numpy(_MICRO * known.field.reshape(-1, 3))
+    survey = FieldMap(low, (len(x), len(y), len(z)), values, (dx, dy, dz))
+    own = (model.std, model.anomaly_std, model.length, model.map_std, model.map_time)
+    return Magnetic((low, high), *own, survey=survey)
+
+
 def _by_end(
     recording: Recording, grid: Grid, stream: str, count: int
 ) -> tuple[list[Floats], list[Any]]:
@@ -120,8 +150,12 @@ def _by_end(
     return once(recording, grid, stream, slots, count, slice(1, None))
 
 
-def _loss(model: StrengthModel) -> PathLoss:
-    return PathLoss(model.std, model.power, model.exponent)
+def _loss(model: StrengthModel, walls: tuple[Box, ...]) -> PathLoss:
+    return PathLoss(model.std, model.power, model.exponent, walls, model.wall_loss)
+
+
+def _walls(recording: Recording) -> tuple[Box, ...]:
+    return tuple((_tuple(low), _tuple(high)) for low, high in recording.walls.values())
 
 
 def _places(recording: Recording, kind: str) -> tuple[tuple[float, ...], ...]:

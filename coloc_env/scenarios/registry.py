@@ -23,6 +23,9 @@ SCENARIOS = Registry(
         "replay-miluv-v0": "coloc_env.scenarios.replay_miluv:replay_miluv",
         "replay-mrclam-v0": "coloc_env.scenarios.replay_mrclam:replay_mrclam",
         "replay-murp-v0": "coloc_env.scenarios.replay_murp:replay_murp",
+        "replay-stein-euroc-team-v0": (
+            "coloc_env.scenarios.replay_stein_euroc:replay_stein_euroc_team"
+        ),
         "replay-stein-euroc-v0": "coloc_env.scenarios.replay_stein_euroc:replay_stein_euroc",
         "replay-tiers-v0": "coloc_env.scenarios.replay_tiers:replay_tiers",
         "replay-tuc-v0": "coloc_env.scenarios.replay_tuc:replay_tuc",

@@ -8,9 +8,24 @@ import torch
 
 from coloc_env.motion import MOTIONS, Arena, Motion, RecordedMotion
 from coloc_env.network import NetworkOptions
-from coloc_env.options import Degrees, Metres, OneOf, PositiveCount, PositiveMetres, PositiveSeconds
-from coloc_env.scenario import ConstantVelocity, Prior, Scenario, TeamOptions, Wheeled
-from coloc_env.sensors import Odometry, Reference, RelativePoseOptions
+from coloc_env.options import (
+    Degrees,
+    Metres,
+    OneOf,
+    PositiveCount,
+    PositiveMetres,
+    PositiveSeconds,
+    PositiveSpeed,
+)
+from coloc_env.scenario import (
+    ConstantVelocity,
+    Inertial,
+    Prior,
+    Scenario,
+    TeamOptions,
+    Wheeled,
+)
+from coloc_env.sensors import Imu, ImuOptions, Odometry, Reference, RelativePoseOptions
 from coloc_env.series import Series
 
 SteinMotion = Annotated[str, OneOf(("static", *MOTIONS))]
@@ -49,19 +64,27 @@ def stein3d(
     size: PositiveMetres = 10.0,
     motion: SteinMotion = "static",
     odometry_noise: tuple[Metres, Degrees] = (0.0, 0.0),
+    imu: bool = False,
+    top_speed: PositiveSpeed = 2.0,
     team: TeamOptions = TeamOptions(n_uavs=3),
     relative_poses: RelativePoseOptions = RelativePoseOptions(),
     network: NetworkOptions = NetworkOptions(),
+    inertial: ImuOptions = ImuOptions(gyro_std=0.003),
 ) -> Scenario:
     """The same in space: UAVs in a cube of 10 m that stand still, and know it.
 
     They stand at (0, 0, 0), (2, 0, 0), (0, 2, 0), … m, level (eq. 27), if no other ``motion`` is
-    asked for, and their odometry has no noise by default. Overrides as in ``stein2d-v0``.
+    asked for, and their odometry has no noise by default. With ``imu`` they have IMUs in place of
+    it, and know of their velocities that no component exceeds ``top_speed`` (m/s) at the start.
+    Other overrides as in ``stein2d-v0``.
     """
     arena = Arena(3, team.n_uavs, dt, 3 * (-0.5 * size,), 3 * (0.5 * size,))
-    odometry = Odometry.of_steps(odometry_noise, dt)
-    parts = (odometry, relative_poses, network, team)
-    return _stein("stein3d-v0", arena, horizon, motion, ConstantVelocity(accel_std=0.1), *parts)
+    parts = (relative_poses, network, team)
+    if not imu:
+        odometry, process = Odometry.of_steps(odometry_noise, dt), ConstantVelocity(accel_std=0.1)
+        return _stein("stein3d-v0", arena, horizon, motion, process, odometry, *parts)
+    made = (arena, horizon, motion, Inertial(), inertial.believed, *parts)
+    return _stein("stein3d-v0", *made, max_speed=top_speed)
 
 
 def _stein(
@@ -69,22 +92,23 @@ def _stein(
     arena: Arena,
     horizon: int,
     motion: str,
-    process: Wheeled | ConstantVelocity,
-    odometry: Odometry,
+    process: Wheeled | ConstantVelocity | Inertial,
+    moved_by: Odometry | Imu,
     relative_poses: RelativePoseOptions,
     network: NetworkOptions,
     team: TeamOptions,
+    max_speed: float | None = None,
 ) -> Scenario:
     return Scenario(
         name=name,
         arena=arena,
         horizon=horizon,
         motion=_motion(motion, arena),
-        sensors=(odometry, relative_poses.true, Reference()),
+        sensors=(moved_by, relative_poses.true, Reference()),
         network=network.network(max_neighbours=max(16, team.n_uavs)),
-        prior=Prior(kind="uniform", attitude_std=3.0),
+        prior=Prior(kind="uniform", attitude_std=3.0, max_speed=max_speed),
         process=process,
-        believed_sensors=(odometry, relative_poses.believed, Reference()),
+        believed_sensors=(moved_by, relative_poses.believed, Reference()),
         failure_rate=team.failure_rate,
         reward=team.reward,
         anchor_uavs=min(1, team.n_uavs - 1),

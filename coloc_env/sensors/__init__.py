@@ -7,6 +7,7 @@ from coloc_env.sensors.compass import Compass, CompassOptions
 from coloc_env.sensors.displacement import Displacement
 from coloc_env.sensors.errors.clock import Clock
 from coloc_env.sensors.errors.range_noise import NlosKind, RangeNoise, RangeOptions
+from coloc_env.sensors.field_map import FieldMap
 from coloc_env.sensors.height import BarometerOptions, Height
 from coloc_env.sensors.imu import GRAVITY, Imu, ImuOptions, RecordedImu, SimulatedImuOptions
 from coloc_env.sensors.ins import Ins, InsOptions
@@ -40,6 +41,7 @@ __all__ = [
     "Compass",
     "CompassOptions",
     "Displacement",
+    "FieldMap",
     "FlowOptions",
     "GnssOptions",
     "Height",

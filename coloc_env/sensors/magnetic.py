@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Annotated, ClassVar
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from coloc_env import noise
@@ -14,8 +14,8 @@ from coloc_env.geometry import cross_matrix, unrotate
 from coloc_env.motion import Box
 from coloc_env.options import Count, Group, PositiveMetres, PositiveSeconds, Quantity, Share
 from coloc_env.sensors.base import MASK, Layout, Leaf, Sensor, Window, require
+from coloc_env.sensors.field_map import MOST, FieldMap
 
-_MOST = 200_000  # nodes of a map
 MicroTesla = Annotated[float, Quantity("µT", 0.0)]
 
 
@@ -29,8 +29,9 @@ class Magnetic(Sensor):
     ``anomaly_std``² exp(−|Δ|² / 2 ℓ²), ℓ = ``length`` (m). (Components are independent: a true
     field has neither sources nor eddies.) It is that of building number ``building``, the same in
     all worlds, as are walls and anchors. The team's map is that with an error N(0, ``map_std``²) at
-    each node, which stays the same while a UAV is near it: about ``map_time`` s. A share
-    ``dropout`` is missing.
+    each node, which stays the same while a UAV is near it: about ``map_time`` s. With a ``survey``
+    nothing is drawn: the field (µT) and the map are both what was surveyed. A share ``dropout`` is
+    missing.
     """
 
     room: Box
@@ -42,6 +43,7 @@ class Magnetic(Sensor):
     building: int = 0
     dropout: float = 0.0
     earth: tuple[float, float, float] = (0.0, 20.0, -44.0)
+    survey: FieldMap | None = None
 
     def __post_init__(self) -> None:
         for name in ("std", "anomaly_std", "map_std"):
@@ -51,8 +53,8 @@ class Magnetic(Sensor):
         require(0 < self.map_time < math.inf, self, "map_time", "a time in s > 0")
         require(self.building >= 0, self, "building", "a number ≥ 0")
         require(0 <= self.dropout <= 1, self, "dropout", "a probability in [0, 1]")
-        fits = math.prod(self.nodes) <= _MOST
-        require(fits, self, "room", f"a map of at most {_MOST} nodes, 1 m apart")
+        fits = self.survey is not None or math.prod(self.nodes) <= MOST
+        require(fits, self, "room", f"a map of at most {MOST} nodes, 1 m apart")
 
     @property
     def nodes(self) -> tuple[int, int, int]:
@@ -71,13 +73,13 @@ class Magnetic(Sensor):
         self, position: Float[Tensor, "*s 3"]
     ) -> tuple[Float[Tensor, "*s 3"], Float[Tensor, "*s 3 3"]]:
         """B (µT, world frame) at positions (m), and ∂B/∂p."""
-        return self._interpolated(_drawn(self)[0], position)
+        return _drawn(self)[0].at(position)
 
     def mapped(
         self, position: Float[Tensor, "*s 3"]
     ) -> tuple[Float[Tensor, "*s 3"], Float[Tensor, "*s 3 3"]]:
         """The same by the team's map."""
-        return self._interpolated(_drawn(self)[1], position)
+        return _drawn(self)[1].at(position)
 
     @staticmethod
     def in_body_by_pose(
@@ -88,32 +90,6 @@ class Magnetic(Sensor):
         """Derivatives of Rᵀ B by δp (world) and δθ (right), from B and ∂B/∂p."""
         seen = (rotation.mT @ field.unsqueeze(-1))[..., 0]
         return torch.cat((rotation.mT @ slope, cross_matrix(seen)), -1)
-
-    def _interpolated(
-        self, nodes: Float64[Tensor, "F 3"], position: Float[Tensor, "*s 3"]
-    ) -> tuple[Float[Tensor, "*s 3"], Float[Tensor, "*s 3 3"]]:
-        """Beyond the map it is as at its edge."""
-        shape = position.new_tensor(self.nodes)
-        inside = position - position.new_tensor(self.room[0])
-        at = inside.clamp_min(0.0).minimum(shape - 1)
-        cell = at.floor().minimum(shape - 2).clamp_min(0.0)
-        index = _corners(cell.to(torch.int64), self.nodes)
-        values = nodes.to(position)[index].unflatten(-2, (2, 2, 2))
-        share = (at - cell).unsqueeze(-1)  # [*s, 3, 1]
-        x, y, z = (share[..., axis, :] for axis in range(3))
-        along_z = torch.lerp(values[..., 0, :], values[..., 1, :], z[..., None, None, :])
-        by_z = values[..., 1, :] - values[..., 0, :]  # [*s, 2, 2, 3]
-        along_y = torch.lerp(along_z[..., 0, :], along_z[..., 1, :], y.unsqueeze(-2))
-        by_y = along_z[..., 1, :] - along_z[..., 0, :]  # [*s, 2, 3]
-        by_z = torch.lerp(by_z[..., 0, :], by_z[..., 1, :], y.unsqueeze(-2))
-        value = torch.lerp(along_y[..., 0, :], along_y[..., 1, :], x)
-        slopes = (
-            along_y[..., 1, :] - along_y[..., 0, :],
-            torch.lerp(by_y[..., 0, :], by_y[..., 1, :], x),
-            torch.lerp(by_z[..., 0, :], by_z[..., 1, :], x),
-        )
-        within = (inside == at).to(position.dtype).unsqueeze(-2)
-        return value, torch.stack(slopes, -1) * within
 
     def sample(self, window: Window, placed: dict[str, Tensor]) -> dict[str, Tensor]:
         motion = window.motion
@@ -128,15 +104,20 @@ class Magnetic(Sensor):
 
 
 @lru_cache(maxsize=8)
-def _drawn(sensor: Magnetic) -> tuple[Float64[Tensor, "F 3"], Float64[Tensor, "F 3"]]:
-    """The field at the nodes (µT), z fastest, and the map of it."""
+def _drawn(sensor: Magnetic) -> tuple[FieldMap, FieldMap]:
+    """The field (µT), and the map of it."""
+    if sensor.survey is not None:
+        return sensor.survey, sensor.survey
     key, shape = noise.row_keys(torch.tensor([sensor.building])), (*sensor.nodes, 3)
     field = noise.normal(key, "magnetic.anomaly", math.prod(shape)).double().view(shape)
     for axis, n in enumerate(sensor.nodes):
         field = (field.movedim(axis, -1) @ _root(n, sensor.length).mT).movedim(-1, axis)
     true = sensor.anomaly_std * field + field.new_tensor(sensor.earth)
     error = noise.normal(key, "magnetic.map", math.prod(shape)).double().view(shape)
-    return true.reshape(-1, 3), (true + sensor.map_std * error).reshape(-1, 3)
+    true, known = (x.reshape(-1, 3) for x in (true, true + sensor.map_std * error))
+    x, y, z = sensor.room[0]
+    low = (x, y, z)
+    return FieldMap(low, sensor.nodes, true), FieldMap(low, sensor.nodes, known)
 
 
 def _root(n: int, length: float) -> Float64[Tensor, "n n"]:
@@ -144,14 +125,6 @@ def _root(n: int, length: float) -> Float64[Tensor, "n n"]:
     i = torch.arange(n, dtype=torch.float64)
     covariance = (-0.5 * ((i - i.unsqueeze(-1)) / length) ** 2).exp()
     return torch.linalg.cholesky(covariance + 1e-9 * torch.eye(n, dtype=torch.float64))
-
-
-def _corners(cell: Int64[Tensor, "*s 3"], nodes: tuple[int, int, int]) -> Int64[Tensor, "*s 8"]:
-    """Flat indices of the eight nodes of a cell, z fastest; a map one node thick repeats it."""
-    steps = [torch.arange(2, device=cell.device).clamp_max(n - 1) for n in nodes]
-    x, y, z = (cell[..., axis, None] + step for axis, step in enumerate(steps))
-    plane = x.unsqueeze(-1) * nodes[1] + y.unsqueeze(-2)
-    return (plane.unsqueeze(-1) * nodes[2] + z[..., None, None, :]).flatten(-3)
 
 
 @dataclass(frozen=True)

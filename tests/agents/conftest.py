@@ -92,6 +92,7 @@ FAMILIES: dict[str, Callable[[], Scenario]] = {
     "campus": lambda: make_scenario("campus-v0", flight="s3", dt=0.5),
     "stein2d": lambda: make_scenario("stein2d-v0", matches_per_step=2),
     "stein3d": lambda: make_scenario("stein3d-v0", n_uavs=4),
+    "stein_imu": lambda: make_scenario("stein3d-v0", n_uavs=4, imu=True, motion="random"),
 }
 ALL = "huber+gate+ransac+temporal+cross"
 VARIANTS = (
@@ -157,11 +158,12 @@ CHOSEN = {
     **dict.fromkeys(("fcmds", "gn"), ("anchors", "many", "tags")),
     "stdcl": ("anchors", "swarm", "campus"),
     "stgat": ("swarm",),
-    **dict.fromkeys(("cspf", "pf_joint", "pose_graph"), ("stein2d", "stein3d")),
+    **dict.fromkeys(("cspf", "pose_graph"), ("stein2d", "stein3d", "stein_imu")),
+    "pf_joint": ("stein2d", "stein3d"),
     **dict.fromkeys(("slam", "slam_central"), ("unmapped",)),
     "stein_vi": ("sight", "sight_few", "sight_uniform", "sight_bias"),
 }
-SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "ranges", "many")
+SPECIAL = ("wsn", "swarm", "campus", "stein2d", "stein3d", "stein_imu", "ranges", "many")
 SPECIAL = (
     *SPECIAL,
     "unmapped",

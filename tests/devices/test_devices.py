@@ -65,6 +65,10 @@ def test_a_filter_and_a_network(agent: str) -> None:
     _same_there(agent, make_scenario("indoor-v0", n_uavs=2))
 
 
+def test_a_team_with_imus() -> None:
+    _same_there("cspf:particles=4", make_scenario("stein3d-v0", imu=True, motion="random"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", AT_HOME, ids=lambda task: f"{task.agent}-{task.scenario}")
 def test_every_localizer(task: Task) -> None:

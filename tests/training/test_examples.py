@@ -111,6 +111,12 @@ def test_rllib_learns() -> None:
 
 
 @pytest.mark.slow
+def test_skrl_learns() -> None:
+    found = example("skrl_ippo", "skrl").main(steps=2_000, horizon=50, episodes=1)
+    assert found["after"] < 0.5 * found["before"]
+
+
+@pytest.mark.slow
 def test_benchmarl_learns() -> None:
     found = example("benchmarl_mappo", "benchmarl").main(iterations=4, worlds=10, horizon=50)
     assert found["after"] < found["before"]

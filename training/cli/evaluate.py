@@ -121,7 +121,8 @@ def _show(found: "Evaluation") -> None:
     )
 
     columns = {key: title for key, title in COLUMNS.items() if key not in _TOO_WIDE}
-    typer.echo(f"{heading(found)}; position errors in m")
+    consistent = f"NEES: {found.scenario.arena.dim} is consistent, more is overconfident"
+    typer.echo(f"{heading(found)}; position errors in m; {consistent}")
     show(["", *columns.values()], rows(found, columns))
     if found.innovations:
         show(list(INNOVATION_COLUMNS), innovation_rows(found))

@@ -6,6 +6,19 @@ import typer
 
 from training.cli.terminal import explain, show
 
+_FAMILIES = {  # of agents, by their package
+    "agents.kalman": "Kalman filters",
+    "agents.particle": "particle filters",
+    "agents.trust": "learned trust",
+    "agents.factor_graph": "factor graphs",
+    "agents.slam": "SLAM",
+    "agents.stein": "Stein particles",
+    "agents.swarm": "whole teams by their ranges: scaling, majorization, least squares",
+    "agents.stdcl": "graph networks",
+    "agents.policies": "trained policies",
+}
+_OWN = "your own and installed packages'"
+
 
 def scenarios(
     name: Annotated[
@@ -47,7 +60,16 @@ def agents(
     from agents import LOCALIZERS
 
     if name is None:
-        show(["agent", ""], [[key, LOCALIZERS.summary(key)] for key in LOCALIZERS])
+        families: dict[str, list[str]] = {family: [] for family in (*_FAMILIES.values(), _OWN)}
+        for key in LOCALIZERS:
+            package = LOCALIZERS.module(key).rpartition(".")[0]
+            families[_FAMILIES.get(package, _OWN)].append(key)
+        width = max(map(len, LOCALIZERS))
+        for family, names in families.items():
+            if names:
+                typer.secho(f"\n{family}", bold=True)
+                lines = [[key.ljust(width), LOCALIZERS.summary(key)] for key in names]
+                show(["", ""], lines)
         typer.echo("coloc agents AGENT lists its options, written AGENT:option=value:option=value.")
     else:
         explain(name, LOCALIZERS, "option")

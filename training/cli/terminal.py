@@ -17,6 +17,7 @@ from coloc_env.options import paragraphs, typed
 from coloc_env.registry import Registry
 
 _PIPED = 160  # columns of a table that no terminal shows
+_QUIET = 30.0  # s without a line of progress
 
 
 def explain(name: str, registry: Registry, kind: str) -> None:
@@ -42,9 +43,10 @@ def explain(name: str, registry: Registry, kind: str) -> None:
 
 
 def show(header: list[str], lines: list[list[str]]) -> None:
-    """Print a table: a title a column, and lines of as many cells. Beyond three columns, all but
-    the first are numbers; where it must be narrowed, words give way to names and numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    """Print a table: a title a column (all empty: no header), and lines of as many cells. Beyond
+    three columns, all but the first are numbers; where it must be narrowed, words give way to names
+    and numbers."""
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(header))
     numbers = len(header) > 3
     for i, title in enumerate(header):
         right = numbers and i > 0
@@ -59,24 +61,31 @@ def show(header: list[str], lines: list[list[str]]) -> None:
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Bars on stderr, where that is a terminal, or in a notebook's cell (by ipywidgets); in CI (the
-    variable ``CI`` is set) a line for each task that is done. The block is given a function to call
-    with a task's name, how much of it is done, and of how much; each task has a bar of its own."""
+    """Bars on stderr, where that is a terminal, or in a notebook's cell (by ipywidgets); elsewhere
+    a line every half minute, and in CI (the variable ``CI`` is set) one for each task that is done.
+    The block is given a function to call with a task's name, how much of it is done, and of
+    how much; each task has a bar of its own."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     hidden = not (console.is_terminal or console.is_jupyter)
-    in_lines = hidden and bool(os.environ.get("CI"))
-    start = time.monotonic()
+    in_ci = bool(os.environ.get("CI"))
+    start = last = time.monotonic()
     with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
         tasks: dict[str, Any] = {}
         said: set[str] = set()
 
         def advance(what: str, done: int, total: int) -> None:
+            nonlocal last
             if what not in tasks:
                 tasks[what] = bars.add_task(escape(what), total=total)
             bars.update(tasks[what], completed=done, total=total)
-            if in_lines and done >= total and what not in said:
-                said.add(what)
-                typer.echo(f"{what}: {total} done, {time.monotonic() - start:.1f} s", err=True)
+            now = time.monotonic()
+            whole = in_ci and done >= total and what not in said
+            if hidden and (whole or now - last > _QUIET):
+                last = now
+                if done >= total:
+                    said.add(what)
+                count = total if done >= total else f"{done} of {total}"
+                typer.echo(f"{what}: {count} done, {now - start:.1f} s", err=True)
 
         yield advance

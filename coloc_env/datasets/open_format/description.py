@@ -8,7 +8,7 @@ import numpy as np
 
 from coloc_env.datasets.folders import entries
 from coloc_env.datasets.open_format.stamps import DIGITS
-from coloc_env.datasets.open_format.yaml_files import YamlFile
+from coloc_env.datasets.open_format.yaml_files import Keys, YamlFile
 from coloc_env.datasets.recording import FARTHEST, Floats
 
 FILE = "recording.yaml"
@@ -17,6 +17,7 @@ LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 ACCELERATIONS = {"m/s2": 1.0, "g": 9.80665}
 PLACES = ("lamps", "access_points", "room")
+CORNERS = ("low", "high")
 KEYS = (
     "name", "dim", "robots", "frame", "units", "time", "map", "tags", "source", "licence", "origin",
     "exchanges", "start", "dropped", "believed", "streams",
@@ -31,7 +32,7 @@ class Description:
     zero, if that is known. ``once``: each exchange of two robots stands in at least one file, and
     both know of it; otherwise each robot knows what stands in its own. ``streams``: those that are
     to come live (``OnlineLocalizer``); what a folder holds shows in the folder. ``places``: what
-    else is on the map, by its kind (``PLACES``).
+    else is on the map, by its kind (``PLACES``). ``walls``: two opposite corners [2, d] of each.
     """
 
     file: YamlFile
@@ -55,6 +56,7 @@ class Description:
     dropped: dict[str, int]
     streams: tuple[str, ...]
     places: dict[str, dict[str, Floats]]
+    walls: dict[str, Floats]
 
 
 def read_description(path: Path) -> Description:
@@ -71,8 +73,8 @@ def read_description(path: Path) -> Description:
     robots = _robots(file, folder)
     file.allow(("units",), ("length", "angle", "acceleration"))
     file.allow(("time",), ("unit", "zero"))
-    file.allow(("map",), ("landmarks", "anchors", *PLACES))
-    file.allow(("map", "room"), ("low", "high"))
+    file.allow(("map",), ("landmarks", "anchors", *PLACES, "walls"))
+    file.allow(("map", "room"), CORNERS)
     length = LENGTHS[file.choice(("units", "length"), LENGTHS, "m")]
     angle = ANGLES[file.choice(("units", "angle"), ANGLES, "rad")]
     acceleration = ACCELERATIONS[file.choice(("units", "acceleration"), ACCELERATIONS, "m/s2")]
@@ -116,6 +118,7 @@ def read_description(path: Path) -> Description:
         dropped={key: file.whole("dropped", key, default=0) for key in file.mapping("dropped")},
         streams=tuple(file.names("streams")),
         places=places,
+        walls=_walls(file, dim, length),
     )
 
 
@@ -133,13 +136,25 @@ def _robots(file: YamlFile, folder: Path) -> tuple[str, ...]:
 
 
 def _places(file: YamlFile, kind: str, dim: int, length: float) -> dict[str, Floats]:
+    return {
+        name: _place(file, ("map", kind, name), dim, length) for name in file.mapping("map", kind)
+    }
+
+
+def _walls(file: YamlFile, dim: int, length: float) -> dict[str, Floats]:
     found = {}
-    for name in file.mapping("map", kind):
-        place = np.array(file.vector("map", kind, name, size=dim)) * length
-        if (np.abs(place) > FARTHEST).any():
-            file.fail(("map", kind, name), f"is no place within {FARTHEST:g} m of the origin")
-        found[name] = place
+    for name in file.mapping("map", "walls"):
+        file.allow(("map", "walls", name), CORNERS)
+        ends = [_place(file, ("map", "walls", name, end), dim, length) for end in CORNERS]
+        found[name] = np.stack(ends)
     return found
+
+
+def _place(file: YamlFile, keys: Keys, dim: int, length: float) -> Floats:
+    place = np.array(file.vector(*keys, size=dim)) * length
+    if (np.abs(place) > FARTHEST).any():
+        file.fail(keys, f"is no place within {FARTHEST:g} m of the origin")
+    return place
 
 
 def _tags(file: YamlFile, robots: tuple[str, ...], dim: int, length: float) -> Floats:

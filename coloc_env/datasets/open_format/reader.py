@@ -13,8 +13,18 @@ from coloc_env.datasets.open_format import streams
 from coloc_env.datasets.open_format.columns import Columns, Kind, read_columns
 from coloc_env.datasets.open_format.description import FILE, Description, read_description
 from coloc_env.datasets.open_format.frames import world
+from coloc_env.datasets.open_format.magnetic_map import FILE as MAGNETIC_MAP
+from coloc_env.datasets.open_format.magnetic_map import read_magnetic_map
 from coloc_env.datasets.open_format.truth import marked_points, read_truth
-from coloc_env.datasets.recording import DataError, Recording, Stamps, Table, Track, near_origin
+from coloc_env.datasets.recording import (
+    DataError,
+    MagneticMap,
+    Recording,
+    Stamps,
+    Table,
+    Track,
+    near_origin,
+)
 from coloc_env.options import unknown
 
 TABLES = (".csv", ".parquet")
@@ -90,7 +100,16 @@ def described(about: Description, found: Mapping[str, tuple[Table, ...]]) -> Rec
         epoch=about.zero,
         start=streams.start_in_world(about),
         places=streams.places_in_world(about),
+        walls=streams.walls_in_world(about),
+        magnetic_map=_magnetic_map(about),
     )
+
+
+def _magnetic_map(about: Description) -> MagneticMap | None:
+    path = about.file.path.parent / MAGNETIC_MAP
+    if about.dim == 2 and path.is_file():
+        raise DataError(f"{path}: a map of the field is for 3 dimensions")
+    return read_magnetic_map(path, about.frame, about.length)
 
 
 def _track(home: Path, about: Description, read: Read) -> Track:
@@ -114,8 +133,14 @@ def _require_known(folder: Path, about: Description) -> None:
         if path.is_dir() and path.name not in about.robots:
             if any(each.suffix in TRUTHS for each in entries(path)):
                 about.file.fail(("robots",), f"does not name {path.name}, which has tables")
-        elif path.is_file() and path.suffix in TABLES and path.stem != POINTS:
-            raise DataError(f"{path}: {unknown('table', path.stem, (POINTS,))}")
+        elif (
+            path.is_file()
+            and path.suffix in TABLES
+            and path.name != MAGNETIC_MAP
+            and path.stem != POINTS
+        ):
+            known = (POINTS, MAGNETIC_MAP.removesuffix(".csv"))
+            raise DataError(f"{path}: {unknown('table', path.stem, known)}")
     for robot in about.robots:
         if not (folder / robot).is_dir():
             about.file.fail(("robots",), f"names {robot!r}, but there is no folder of that name")

@@ -89,6 +89,12 @@ def places_in_world(about: Description) -> dict[str, dict[str, Floats]]:
     return found
 
 
+def walls_in_world(about: Description) -> dict[str, Floats]:
+    """Low and high corners [2, d] of walls in our frames."""
+    both = {name: frames.world(corners, about.frame) for name, corners in about.walls.items()}
+    return {name: np.stack((each.min(0), each.max(0))) for name, each in both.items()}
+
+
 # ------------------------------------------------------------------ one table
 
 

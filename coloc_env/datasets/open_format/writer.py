@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from coloc_env.datasets.open_format.description import FILE
+from coloc_env.datasets.open_format.description import CORNERS, FILE
+from coloc_env.datasets.open_format.magnetic_map import FILE as MAGNETIC_MAP
+from coloc_env.datasets.open_format.magnetic_map import write_magnetic_map
 from coloc_env.datasets.open_format.reader import POINTS
 from coloc_env.datasets.open_format.streams import stream_files
 from coloc_env.datasets.open_format.truth import AXES, GROUPS, QUATERNION
@@ -31,7 +33,7 @@ def write_recording(recording: Recording, out: str | os.PathLike[str]) -> None:
     for name in recording.robots:
         if "/" in name or "\\" in name or name.startswith("."):
             raise DataError(f"{name!r} cannot be the name of a folder")
-    names = (*recording.robots, f"{POINTS}.csv", FILE)
+    names = (*recording.robots, f"{POINTS}.csv", MAGNETIC_MAP, FILE)
     with staged_folder(Path(out), names) as folder:
         for i, robot in enumerate(recording.robots):
             home = folder / robot
@@ -43,6 +45,8 @@ def write_recording(recording: Recording, out: str | os.PathLike[str]) -> None:
                 time, columns = _merged(recording, tables)
                 if len(time):
                     _write(home / f"{file}.csv", time, columns)
+        if recording.magnetic_map is not None:
+            write_magnetic_map(folder / MAGNETIC_MAP, recording.magnetic_map)
         if recording.points:
             _write_points(recording, folder / f"{POINTS}.csv")
         text = yaml.safe_dump(_description(recording), sort_keys=False, allow_unicode=True)
@@ -67,7 +71,11 @@ def _description(recording: Recording) -> dict[str, Any]:
         kind: {name: place.tolist() for name, place in found.items()}
         for kind, found in recording.places.items()
     }
-    about["map"] = {kind: found for kind, found in places.items() if found}
+    walls = {
+        name: dict(zip(CORNERS, ends.tolist(), strict=True))
+        for name, ends in recording.walls.items()
+    }
+    about["map"] = {kind: found for kind, found in (places | {"walls": walls}).items() if found}
     if recording.tags.shape[1]:
         about["tags"] = {
             robot: arms[~np.isnan(arms).any(1)].tolist()

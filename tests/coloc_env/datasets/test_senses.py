@@ -1,5 +1,6 @@
-"""Recorded compass, signal strengths, lamps and ultrasound: read, refused, written, replayed."""
+"""Recorded compass, strengths, lamps, ultrasound and field: read, refused, written, replayed."""
 
+import itertools
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from coloc_env.datasets.open_format import read_recording, write_recording
 from coloc_env.observation import Observation
 from coloc_env.scenario import Scenario
 from coloc_env.scenarios import make_scenario
-from coloc_env.sensors import Compass, Light, Rssi, UavRssi, Ultrasonic
+from coloc_env.sensors import Compass, Light, Magnetic, Rssi, UavRssi, Ultrasonic
 from coloc_env.world import World
 from tests.agents.live_events import events_of, replayed
 from tests.coloc_env.datasets.folders_made import Folder, table, write
@@ -27,9 +28,15 @@ NAMES, STEPS = ("a", "b", "c"), 15
 LEAVES = (
     "compass", "compass_mask", "rssi", "rssi_mask", "rssi_map", "uav_rssi", "uav_rssi_mask",
     "light", "light_direction", "light_mask", "light_map", "ultrasonic", "ultrasonic_mask",
+    "magnetic", "magnetic_mask",
 )  # fmt: skip
 IMU = {"accel_std": 0.05, "accel_bias": 0, "gyro_bias": 0, "accel_walk": 0, "gyro_walk": 0}
-KINDS = (Compass, Light, Rssi, UavRssi, Ultrasonic)
+KINDS = (Compass, Light, Magnetic, Rssi, UavRssi, Ultrasonic)
+WALL = {"low": [14, 9, 0], "high": [16, 11, 5]}
+
+
+NODES = [(x, y, z) for z in (0.5, 2.5) for x in (0.1, 1.35, 2.6) for y in (0.0,)]
+MAP = table("x,y,z,bx,by,bz", [[*p, 1e-5 * p[0], 2e-5, -4e-5 * p[2]] for p in NODES])
 
 
 def small(**tables: str) -> Folder:
@@ -42,9 +49,11 @@ def small(**tables: str) -> Folder:
                     "lamps": {"left": [0, 0, 3], "right": [5, 0, 3]},
                     "access_points": {"door": [1, 2, 3]},
                     "room": {"low": [0, 0, 0], "high": [6, 5, 3]},
+                    "walls": {"thin": {"low": [2, 3, 0], "high": [2.1, 0, 3]}},
                 },
             }
         ),
+        "magnetic_map.csv": MAP,
         "a/truth.csv": "stamp,x,y,z\n0,1,1,1\n1,2,1,1\n",
         "b/truth.csv": "stamp,x,y,z\n0,2,2,1\n1,2,2,1\n",
     }
@@ -62,6 +71,7 @@ TABLES = {
     "rssi": "stamp,to,strength\n0.1,door,-50\n0.1,b,-60.5\n0.2,door,nan\n",
     "light": "stamp,lamp,intensity,x,y,z\n0.1,right,200,0,0.6,0.8\n0.2,left,1,0,0,0\n",
     "ultrasonic": "stamp,forward,back,left,right,up,down\n0.1,1,2,,-1,2.5,0.5\n",
+    "magnetometer": "stamp,x,y,z\n0.1,1e-5,2e-5,-4e-5\n",
 }
 
 
@@ -82,6 +92,14 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
         "lamps": ["left", "right"], "access_points": ["door"], "room": ["low", "high"],
     }  # fmt: skip
     assert again.places["room"]["high"].tolist() == [6, 5, 3]
+    assert again.walls["thin"].tolist() == [[2, 0, 0], [2.1, 3, 3]]
+    known, kept = found.magnetic_map, again.magnetic_map
+    assert known is not None
+    assert kept is not None
+    assert [axis.tolist() for axis in known.axes] == [[0.1, 1.35, 2.6], [0.0], [0.5, 2.5]]
+    assert known.field[2, 0, 1].tolist() == [1e-5 * 2.6, 2e-5, -4e-5 * 2.5]
+    assert kept.field.tobytes() == known.field.tobytes()
+    assert [axis.tobytes() for axis in kept.axes] == [axis.tobytes() for axis in known.axes]
     assert not any("nothing shows where" in words for words in check(again).warnings)
 
 
@@ -95,6 +113,12 @@ def test_other_frames_and_units(tmp_path: Path) -> None:
     assert found.streams["ultrasonic"][0].values[0, 0] == 0.01
     np.testing.assert_allclose(found.places["room"]["low"], [0, 0, -0.03])
     np.testing.assert_allclose(found.places["access_points"]["door"], [0.02, 0.01, -0.03])
+    np.testing.assert_allclose(found.walls["thin"], [[0, 0.02, -0.03], [0.03, 0.021, 0]])
+    known = found.magnetic_map
+    assert known is not None
+    np.testing.assert_allclose(known.axes[1], [0.001, 0.0135, 0.026])
+    np.testing.assert_allclose(known.field[0, 2, 0], [2e-5, 1e-5 * 2.6, 4e-5 * 2.5])
+    np.testing.assert_allclose(found.streams["magnetometer"][0].values, [[1e-5, -2e-5, 4e-5]])
 
 
 @pytest.mark.parametrize(
@@ -127,6 +151,57 @@ def test_a_room_has_two_corners(room: dict[str, Any], words: str, tmp_path: Path
         read(tmp_path, files)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (MAP.replace("2.6", "2.7"), "nodes are 1.25 to 1.35 m apart in x, not evenly"),
+        (MAP.rsplit("\n", 2)[0] + "\n", "5 nodes, not each one of a grid of 3 × 1 × 2 once"),
+        (MAP + MAP.split("\n")[1] + "\n", "7 nodes, not each one of a grid of 3 × 1 × 2 once"),
+        (MAP.replace("bz", "b"), "line 1: a column 'bz' is needed, once"),
+        (MAP + "1,0,0.5,1,nan,1\n", "line 8: six finite numbers are needed"),
+        ("x,y,z,bx,by,bz\n", "no node"),
+    ],
+)
+def test_a_map_of_no_grid_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=words) as error:
+        read(tmp_path, small() | {"magnetic_map.csv": text})
+    assert "magnetic_map.csv" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("wall", "words"),
+    [
+        ({"low": [0, 0, 0]}, "walls.thin.high: None is not 3 finite numbers"),
+        ({"low": [0, 0], "high": [1, 1, 1]}, "walls.thin.low: .* is not 3 finite numbers"),
+        ({"bottom": [0, 0, 0]}, "walls.thin.bottom"),
+    ],
+)
+def test_a_wall_has_two_corners(wall: dict[str, Any], words: str, tmp_path: Path) -> None:
+    files = small(compass=TABLES["compass"])
+    about = yaml.safe_load(files["recording.yaml"])
+    about["map"]["walls"] = {"thin": wall}
+    files["recording.yaml"] = yaml.safe_dump(about)
+    with pytest.raises(DataError, match=words):
+        read(tmp_path, files)
+
+
+def test_a_field_without_a_map_is_not_used(tmp_path: Path) -> None:
+    files = small(magnetometer=TABLES["magnetometer"], compass=TABLES["compass"])
+    with pytest.warns(UserWarning, match="does not use magnetometer"):
+        make_scenario("replay-v0", path=str(write(tmp_path / "none", without_map(files))))
+    known = make_scenario("replay-v0", path=str(write(tmp_path / "map", files)))
+    sensor = known.believed.sensor(Magnetic)
+    assert sensor is not None
+    at = torch.tensor([[0.725, 0.4, 1.0]], dtype=torch.float64)
+    b, slope = sensor.mapped(at)  # linear in x and z, the same for all y
+    torch.testing.assert_close(b, torch.tensor([[7.25, 20.0, -40.0]], dtype=torch.float64))
+    assert slope[0].diagonal().tolist() == pytest.approx([10.0, 0.0, -40.0])
+
+
+def without_map(files: Folder) -> Folder:
+    return {name: text for name, text in files.items() if name != "magnetic_map.csv"}
+
+
 # ---------------------------------------------------------------- a recording of a simulated team
 
 
@@ -135,12 +210,15 @@ def simulated() -> tuple[Scenario, list[Observation], Folder]:
     recording, with numbers as they were."""
     scenario = make_scenario(
         "indoor-v0", n_uavs=3, landmarks=0, uwb=False, compass=True, rssi=True, rssi_uavs=True,
-        light=True, ultrasonic=True, ultrasonic_dropout=0.0, dt=0.1,
+        light=True, ultrasonic=True, ultrasonic_dropout=0.0, dt=0.1, magnetic=True,
+        walls=tuple(map(float, (*WALL["low"], *WALL["high"]))),
     )  # fmt: skip
     world = World(scenario)
     rssi, light = scenario.believed.sensor(Rssi), scenario.believed.sensor(Light)
+    field = scenario.believed.sensor(Magnetic)
     assert rssi is not None
     assert light is not None
+    assert field is not None
     rows: dict[str, list[list[Any]]] = {}
     seen, observations = world.reset(7), []
     for k in range(STEPS):
@@ -165,6 +243,7 @@ def simulated() -> tuple[Scenario, list[Observation], Folder]:
                     way = leaf["light_direction"][3 * m : 3 * m + 3]
                     put("light", f"l{m}", leaf["light"][m], *way)
             pairs = zip(leaf["ultrasonic"], leaf["ultrasonic_mask"], strict=True)
+            put("magnetometer", *(1e-6 * z for z in leaf["magnetic"]))
             put("ultrasonic", *("" if not there else z for z, there in pairs))
         world.advance(torch.zeros(1, 3, 9))
         seen = world.observation()
@@ -175,6 +254,7 @@ def simulated() -> tuple[Scenario, list[Observation], Folder]:
         "rssi": "to,strength",
         "light": "lamp,intensity,x,y,z",
         "ultrasonic": "forward,back,left,right,up,down",
+        "magnetometer": "x,y,z",
     }
     files = {f"{k}.csv": table(f"stamp,{heads[k.split('/')[1]]}", v) for k, v in rows.items()}
     arena = scenario.arena
@@ -186,9 +266,13 @@ def simulated() -> tuple[Scenario, list[Observation], Folder]:
                 "lamps": {f"l{m}": list(place) for m, place in enumerate(light.lamps)},
                 "access_points": {f"p{m}": list(place) for m, place in enumerate(rssi.points)},
                 "room": {"low": list(arena.low), "high": list(arena.high)},
+                "walls": {"pillar": WALL},
             },
         }
     )
+    nodes = torch.tensor(list(itertools.product(*map(range, field.nodes))), dtype=torch.float64)
+    known = torch.cat((nodes, 1e-6 * field.mapped(nodes)[0]), 1)
+    files["magnetic_map.csv"] = table("x,y,z,bx,by,bz", known.tolist())
     return scenario, observations, files
 
 

@@ -238,7 +238,14 @@ CHANGED: dict[str, dict[str, Any]] = {
         "comm_radius": 10.0,
     },
     "stein2d-v0": {**STEIN, "motion": "circle"},
-    "stein3d-v0": {**STEIN, "motion": "random"},
+    "stein3d-v0": {
+        **STEIN,
+        "motion": "random",
+        "imu": True,
+        "top_speed": 5.0,
+        "accel_std": 0.4,
+        "gyro_std": 0.3,
+    },
 }
 # Overrides that show only together with another.
 RANGES_WITH: dict[str, dict[str, Any]] = {
@@ -322,7 +329,11 @@ WITH: dict[str, dict[str, dict[str, Any]]] = {
         "wall_excess": {"flight": "s3", "wall_loss": 0.0},
     },
     "stein2d-v0": FAILING | CALLED,
-    "stein3d-v0": FAILING | CALLED,
+    "stein3d-v0": {
+        **FAILING,
+        **CALLED,
+        **{name: {"imu": True} for name in ("top_speed", "accel_std", "gyro_std")},
+    },
 }
 SMALL: dict[str, dict[str, Any]] = {"swarm-v0": {"n_uavs": 6, "anchor_share": 0.3, "nlos": 0.4}}
 EACH = [(family, name) for family, changed in CHANGED.items() for name in changed]

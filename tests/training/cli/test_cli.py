@@ -311,6 +311,19 @@ def test_in_ci_a_task_that_is_done_is_a_line(
         assert said.count("\n") == there
 
 
+def test_where_nobody_sees_bars_half_a_minute_without_a_line_is_the_longest(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CI", "")
+    now = [0.0]
+    monkeypatch.setattr("training.cli.terminal.time.monotonic", lambda: now[0])
+    with progress() as bars:
+        for done in range(1, 10):
+            now[0] += 10.0
+            bars("ekf", done, 9)
+    assert capsys.readouterr().err == "ekf: 4 of 9 done, 40.0 s\nekf: 8 of 9 done, 80.0 s\n"
+
+
 def test_in_a_notebook_bars_are_a_widget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     widgets = ModuleType("ipywidgets")
@@ -330,7 +343,9 @@ def test_lists() -> None:
     settings = coloc("scenarios", "indoor-v0").stdout
     assert "landmark_radius" in settings
     assert "30.0,20.0,5.0" in settings
-    assert "test_still" in coloc("agents").stdout
+    agents = coloc("agents").stdout
+    assert "test_still" in agents.partition("your own")[2]
+    assert "ekf" in agents.partition("Kalman filters")[2].partition("particle filters")[0]
     options = coloc("agents", "test_still").stdout
     assert "offset" in options
     assert "a number" in options

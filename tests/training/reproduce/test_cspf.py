@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from made import Made, runs_of
 
+from coloc_env.datasets import DataError
 from coloc_env.scenarios import make_scenario
-from training.reproduce.cspf import clouds, cspf, plan
+from training.evaluation.evaluate import evaluate
+from training.reproduce.cspf import clouds, cspf, particle_errors, plan
 from training.reproduce.cspf.claims import claims, real
 from training.reproduce.cspf.plan import converged, converged_over_time, late_nees, worst
 from training.reproduce.results import Runs
@@ -68,6 +70,30 @@ def test_clouds_are_of_one_run_beside_its_truth() -> None:
     assert clouds.plane(results) is clouds.coordinates(results) is clouds.space(results) is None
 
 
+@pytest.mark.slow
+def test_particles_errors_are_of_the_run_that_the_study_has() -> None:
+    """Beside the smoother's run in the same world: the filter's estimate lies within its cloud."""
+    both, where = ("stein_vi", plan.SMOOTHER), plan.euroc(*plan.SHOWN, 12)
+    try:
+        scenario = where.build()
+    except DataError as error:
+        pytest.skip(str(error))
+    stored = particle_errors.compute(Piece(where, both[:1], 0, 1, plan.ERRORS), lambda *_: None)
+    cloud = particle_errors.load(where, *stored)
+    assert cloud.shape == (12, 20)
+    met = evaluate(scenario, both, runs=1, bound=False)
+    estimate = met.agents["stein_vi"].error[0, :, 0]
+    assert (cloud.amin(-1).numpy() <= estimate).all()
+    assert (estimate <= cloud.amax(-1).numpy()).all()
+    runs = {agent: Runs(met, agent) for agent in both}
+    results: Any = SimpleNamespace(get=lambda *_: cloud, runs=lambda *_: runs)
+    figure = particle_errors.errors(results)
+    assert figure is not None
+    assert len(figure.axes[0].lines) == 22
+    del runs[plan.SMOOTHER]
+    assert particle_errors.errors(results) is None
+
+
 def found(good: bool) -> Made:
     """All that claims need, in favour of them all or against."""
     there: dict[Any, Runs] = {}
@@ -121,7 +147,8 @@ def test_claims_about_recordings_follow_the_runs(settings: Settings) -> None:
         runs.record.error[:] *= rng.uniform(0.9, 1.1, (RUNS, 1, 1))
         return runs
 
-    better, worse = ("stein_vi", plan.FAST), (WORLD, "stein_vi:particles=1", *plan.TEAM[1:])
+    better = ("stein_vi", plan.FAST, "cspf")
+    worse = (WORLD, *plan.ALONE[1:], *plan.TEAM[1:], *plan.INERTIAL[1:])
     for good, verdict in ((True, REPRODUCED), (False, CONTRADICTED)):
         near, far = (0.1, 0.5) if good else (0.5, 0.1)
         there = {(a,): some(near) for a in better} | {(a,): some(far) for a in worse}

@@ -1,6 +1,6 @@
 """CSPF: the claims of the collaborative Stein particle filter, outliers, and what lies beyond."""
 
-from training.reproduce.cspf import claims, clouds, plan, report
+from training.reproduce.cspf import claims, clouds, particle_errors, plan, report
 from training.reproduce.study import Part, Study
 
 
@@ -16,6 +16,12 @@ def cspf() -> Study:
         figures=report.FIGURES | clouds.FIGURES,
     )
     beyond = Part("Beyond the paper", plan.beyond, tables=report.beyond_tables)
-    real = Part("Recordings", plan.real, claims=claims.real, tables=report.real_tables)
+    real = Part(
+        "Recordings",
+        plan.real,
+        claims=claims.real,
+        tables=report.real_tables,
+        figures=particle_errors.FIGURES,
+    )
     parts = {"paper": own, "robustness": beyond, "real": real}
     return Study("cspf", "CSPF", plan.TITLE, 100, parts)

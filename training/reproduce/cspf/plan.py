@@ -40,6 +40,12 @@ DRAWN = Kind(  # one run, whose particles the paper's figures show
     "training.reproduce.cspf.clouds:load",
     ("training.reproduce.cspf.clouds",),
 )
+ERRORS = Kind(  # one run, whose particles' errors the paper's figure 7 shows
+    "errors",
+    "training.reproduce.cspf.particle_errors:compute",
+    "training.reproduce.cspf.particle_errors:load",
+    ("training.reproduce.cspf.particle_errors",),
+)
 NAMES = {
     "cspf": "CSPF",
     "cspf:consensus=false": "no consensus",
@@ -52,14 +58,17 @@ TEAM = (
     *(FAST, f"{FAST}:consensus=false", f"{FAST}:particles=1"),
     *("pose_graph:every=10", "pose_graph:every=10:robust=gnc"),
 )
+SMOOTHER = "dfgo"  # fixed-lag, with IMU and landmark factors and Huber's loss, as D²SLAM
 ALONE = (
     *("stein_vi", "stein_vi:particles=1", "ekf", "ekf:robust=huber", "ekf:robust=gate"),
-    "pf:particles=20",
+    *("pf:particles=20", SMOOTHER, f"{SMOOTHER}:robust=student", f"{SMOOTHER}:robust=mixture"),
 )
+INERTIAL = ("cspf", "cspf:consensus=false", "cspf:particles=1", "pose_graph:every=10")
 SEQUENCES = ("V1_01_easy", "V1_03_difficult", "MH_04_difficult")
 TRIALS = ("09", "14", "16")
-WRONG = (0.0, 0.2, 0.4)  # of MURP's poses
+WRONG = (0.0, 0.2, 0.4)  # of MURP's poses, and of those between EuRoC's flights
 MISTAKEN = (0.0, 0.1)  # of EuRoC's landmarks
+SHOWN = ("V1_03_difficult", 0.1)  # figure 7
 
 
 def drawn(dim: int) -> str:
@@ -154,14 +163,30 @@ def euroc(sequence: str, mistaken: float, steps: int | None = None) -> Variant:
     )
 
 
+def flights(outliers: float, steps: int | None = None) -> Variant:
+    """EuRoC's flights in one room together, by IMUs and relative poses, so many of them wrong."""
+    return Variant(
+        f"euroc-team-outliers={outliers}",
+        f"EuRoC together, outliers {outliers:g}",
+        (("outliers", outliers),),
+        "replay-stein-euroc-team-v0",
+        steps,
+        bounded=False,
+    )
+
+
 def real(settings: Settings) -> Iterator[Cell]:
-    """Three agents with ranges (MURP), and one with an IMU and landmarks (EuRoC)."""
+    """Three agents with ranges (MURP), three with IMUs (EuRoC), and one with an IMU and landmarks
+    (EuRoC)."""
     for trial in TRIALS:
         for share in WRONG:
             yield Cell(murp(trial, share, settings.steps), TEAM, settings.fraction(10))
+    for share in WRONG:
+        yield Cell(flights(share, settings.steps), INERTIAL, settings.fraction(10))
     for name in SEQUENCES:
         for share in MISTAKEN:
             yield Cell(euroc(name, share, settings.steps), ALONE, settings.fraction(10))
+    yield Cell(euroc(*SHOWN, settings.steps), ("stein_vi",), kind=ERRORS)
 
 
 # ------------------------------------------------------------------ measures

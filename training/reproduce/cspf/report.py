@@ -54,6 +54,8 @@ def real_tables(results: Results) -> Iterator[Table]:
     """Errors on recordings."""
     keys = [plan.murp(trial, x).key for trial in plan.TRIALS for x in plan.WRONG]
     team = _places(results, keys, (WORLD, *plan.TEAM))
+    keys = [plan.flights(x).key for x in plan.WRONG]
+    inertial = _places(results, keys, (WORLD, *plan.INERTIAL))
     keys = [plan.euroc(name, x).key for name in plan.SEQUENCES for x in plan.MISTAKEN]
     columns = [
         ("runs", lambda one: str(len(one.error))),
@@ -64,7 +66,7 @@ def real_tables(results: Results) -> Iterator[Table]:
         ("NEES", shortened(late_nees)),
         ("ms a step", _cost),
     ]
-    places = team | _places(results, keys, (WORLD, *plan.ALONE))
+    places = team | inertial | _places(results, keys, (WORLD, *plan.ALONE))
     yield by_agent("Errors", places, columns, where="recording")
 
 

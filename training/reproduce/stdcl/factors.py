@@ -18,6 +18,8 @@ WHOLE = "map:bias=joint:factors=ep"
 LEARNED = "stdcl"
 RIVALS = ("map:confidence=huber", "map:confidence=gnc", "map:factors=weights:starts=5")
 METHODS = (BEFORE, JOINT, WHOLE, LEARNED, *RIVALS)
+# Of one joint graph over the last steps; in the swarms only.
+SMOOTHERS = ("dfgo_central:window=5", "dfgo_central:window=5:robust=mixture")
 _SIZE = (6694.0, 6694.0, 3347.0)  # m: the density of 200 UAVs in 10 × 10 × 5 km
 _S3_STEPS = 1200  # of 9000: two minutes of the patrol
 
@@ -56,7 +58,7 @@ def cells(settings: Settings) -> Iterator[Cell]:
     """A tenth of the runs of the main table, in the same worlds for all."""
     some = settings.fraction(10)
     for variant in SWARM:
-        yield Cell(variant, METHODS, some)
+        yield Cell(variant, (*METHODS, *SMOOTHERS), some)
         yield Cell(variant, (), max(1, some // 2), POSTERIOR)
     for variant in flights(settings):
         yield Cell(variant, METHODS, some)
@@ -96,7 +98,7 @@ def table(results: Results) -> Iterator[Table]:
         there = results.runs(variant.key)
         bound = results.get(variant.key, "", POSTERIOR)
         allowed = number(None if bound is None else rmse_of_bound(bound), "{:.1f}")
-        for agent in (agent for agent in METHODS if agent in there):
+        for agent in (agent for agent in (*METHODS, *SMOOTHERS) if agent in there):
             one = there[agent]
             gain = _gain(one, there[BEFORE]) if BEFORE in there else None
             figures = (rmse_of_all(one), quantile(0.5)(one), quantile(0.9)(one))
