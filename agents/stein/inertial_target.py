@@ -75,6 +75,8 @@ class InertialTarget:
     ) -> Float64[Tensor, "B N 3 3"]:
         """From the inverse of the information Jᵀ P J + Λ of all states; UAV 0's is any."""
         n = estimate.shape[2]
+        if n == 1:
+            return estimate.new_zeros(*estimate.shape[:2], 3, 3)
         prior = [1 / v for v in self.uniform] + [self.velocity_std**-2] * 3
         information = self._summed(inliers.unsqueeze(-1))[:, :, 0]
         information.diagonal(dim1=-2, dim2=-1).add_(information.new_tensor(prior * (n - 1)))

@@ -189,7 +189,7 @@ def record(
                 [record(localizer, scenario, half, progress, device) for half in halves]
             )
         found = _recorded(localizer, scenario, seeds, progress, breakdown.k, device)
-        return replace(found, broken=np.ones(1, bool), messages=(str(breakdown),))
+        return replace(found, broken=np.ones(1, bool), messages=(" ".join(str(breakdown).split()),))
 
 
 def _recorded(

@@ -20,7 +20,7 @@ then NaN; a name."""
 TUM = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 _STAMP = 48  # characters of a stamp
 _MOST = 1e9  # of anything recorded, in any unit
-_DELIMITERS = ",;\t"
+DELIMITERS = ",;\t"
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +246,7 @@ def _header(path: Path, head: str) -> tuple[str, list[str]]:
     """The delimiter of a file and the names of its columns."""
     head = head.lstrip("#")
     cut = {
-        mark: [cell.strip().strip('"').lower() for cell in head.split(mark)] for mark in _DELIMITERS
+        mark: [cell.strip().strip('"').lower() for cell in head.split(mark)] for mark in DELIMITERS
     }
     having = {mark: names for mark, names in cut.items() if "stamp" in names}
     if not having:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coloc_env.datasets.open_format import frames
+from coloc_env.datasets.open_format.columns import DELIMITERS
 from coloc_env.datasets.open_format.truth import AXES
 from coloc_env.datasets.recording import DataError, Floats, MagneticMap
 from coloc_env.sensors.field_map import MOST
@@ -14,6 +15,7 @@ from coloc_env.sensors.field_map import MOST
 FILE = "magnetic_map.csv"
 COLUMNS = (*AXES, "bx", "by", "bz")
 _EVEN = 1e-6  # of a spacing, by which nodes may be off
+_STRONGEST = 1.0  # T: twenty thousand times the Earth's
 
 
 def read_magnetic_map(path: Path, frame: str, length: float) -> MagneticMap | None:
@@ -61,7 +63,9 @@ def write_magnetic_map(path: Path, known: MagneticMap) -> None:
 def _rows(path: Path) -> Floats:
     """The numbers [F, 6] of the file's columns."""
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        text = path.read_text(encoding="utf-8-sig").splitlines()
+        mark = max(DELIMITERS, key=text[0].count) if text else ","
+        lines = list(csv.reader(text, delimiter=mark))
     except (OSError, UnicodeDecodeError, csv.Error):
         raise DataError(f"{path}: not a CSV file of UTF-8 text") from None
     head = [name.strip().lower() for name in lines[0]] if lines else []
@@ -73,7 +77,7 @@ def _rows(path: Path) -> Floats:
     at = [head.index(name) for name in COLUMNS]
     rows = []
     for line, cells in enumerate(lines[1:], 2):
-        if not any(cell.strip() for cell in cells):
+        if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
             continue
         try:
             row = [float(cells[i]) for i in at]
@@ -81,6 +85,8 @@ def _rows(path: Path) -> Floats:
             row = [np.nan]
         if not np.isfinite(row).all():
             raise DataError(f"{path}, line {line}: six finite numbers are needed")
+        if (strongest := max(map(abs, row[3:]))) > _STRONGEST:
+            raise DataError(f"{path}, line {line}: a field of {strongest:g} T; tesla are needed")
         rows.append(row)
     if not rows:
         raise DataError(f"{path}: no node")

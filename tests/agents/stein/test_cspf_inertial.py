@@ -68,6 +68,16 @@ def test_what_is_sent_is_counted(tools: SimpleNamespace) -> None:
         torch.testing.assert_close(sent, torch.full((1, 4), 4.0 * numbers))
 
 
+def test_one_uav_is_the_frame() -> None:
+    scenario = team(n_uavs=1)
+    filter, observation = make("cspf", scenario), World(scenario).reset([0])
+    estimate = filter.step(filter.reset(observation), observation)[1]
+    place = observation["reference"][..., :3].double()
+    torch.testing.assert_close(estimate.position, place)
+    assert estimate.covariance is not None
+    assert estimate.covariance.isfinite().all()
+
+
 def test_a_team_with_imus_has_this_filter_and_no_variant() -> None:
     assert isinstance(make("cspf", team()), InertialSteinFilter)
     with pytest.raises(ValueError, match=r"^cspf: variant is not allowed in a team with IMUs"):

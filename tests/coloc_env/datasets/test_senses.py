@@ -160,6 +160,7 @@ def test_a_room_has_two_corners(room: dict[str, Any], words: str, tmp_path: Path
         (MAP.replace("bz", "b"), "line 1: a column 'bz' is needed, once"),
         (MAP + "1,0,0.5,1,nan,1\n", "line 8: six finite numbers are needed"),
         ("x,y,z,bx,by,bz\n", "no node"),
+        (MAP + "9,0,0.5,10,20,-40\n", "line 8: a field of 40 T; tesla are needed"),
     ],
 )
 def test_a_map_of_no_grid_is_refused(text: str, words: str, tmp_path: Path) -> None:
@@ -183,6 +184,16 @@ def test_a_wall_has_two_corners(wall: dict[str, Any], words: str, tmp_path: Path
     files["recording.yaml"] = yaml.safe_dump(about)
     with pytest.raises(DataError, match=words):
         read(tmp_path, files)
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_map_is_written_as_tables_are(mark: str, tmp_path: Path) -> None:
+    text = MAP.replace(",", mark).replace("\n", "\n# measured on Monday\n\n", 1)
+    found = read(tmp_path / "other", small() | {"magnetic_map.csv": text}).magnetic_map
+    known = read(tmp_path / "commas", small()).magnetic_map
+    assert found is not None
+    assert known is not None
+    np.testing.assert_array_equal(found.field, known.field)
 
 
 def test_a_field_without_a_map_is_not_used(tmp_path: Path) -> None:
