@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from agents.layers import Linear, sigmoid
+from agents.layers import Linear
 from agents.weights import Learned
 
 HIDDEN = 12
@@ -25,8 +25,26 @@ class WeightCorrector(Learned):
         self.hidden = Linear(6, HIDDEN)
         self.out = Linear(HIDDEN, 1)
 
-    def forward(self, features: Float[Tensor, "*s 6"]) -> Float[Tensor, "*s"]:
-        return sigmoid(self.out(torch.tanh(self.hidden(features))))[..., 0]
+    def forward(self, features: Float[Tensor, "*s m 6"]) -> Float[Tensor, "*s m"]:
+        """By tanh x = 1 − 2 / (1 + e²ˣ), which costs half as much as torch's tanh. The output is
+        computed four times: products with fewer rows round by how many columns (particles) there
+        are."""
+        first, second = self.hidden, self.out
+        s = _falling(_affine(2 * first.weight, 2 * first.bias, features.mT))
+        weight, bias = (2 * second.weight).expand(4, -1), second.bias + second.weight.sum(-1)
+        return _falling(_affine(weight, -bias, s)[..., 0, :])
+
+
+def _affine(
+    weight: Float[Tensor, "o i"], bias: Float[Tensor, "#o"], x: Float[Tensor, "*s i m"]
+) -> Float[Tensor, "*s o m"]:
+    """W x + b of every column, those of each UAV in a product of their own."""
+    return (weight.expand(*x.shape[:-2], *weight.shape) @ x).add_(bias.unsqueeze(-1))
+
+
+def _falling(x: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """1 / (1 + eˣ), constant where eˣ would overflow."""
+    return (1 + x.clamp_max(80.0).exp()).reciprocal_()
 
 
 def motion_features(

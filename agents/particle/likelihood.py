@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from agents.models import rotations
 from agents.models.measurements import (
     AnchorRanges,
     Block,

@@ -4,6 +4,7 @@ All scalars are dimensionless: lengths are in standard deviations of a range or 
 position. Sums over links are weighted means, so that networks transfer to teams of other sizes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -12,6 +13,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from agents.swarm.belief import Solution, StepInput
+from agents.swarm.confidence import Weights
 from agents.swarm.links import own_information
 from agents.swarm.pairs import Pairs, norm
 
@@ -97,18 +99,19 @@ def initial_means(worlds: int, n: int, dim: int, device: torch.device) -> Runnin
 def graph_inputs(
     inputs: StepInput,
     solution: Solution,
-    weight: Float64[Tensor, "B E"],
-    shift: Float64[Tensor, "B E"],
+    weights: Callable[[Float64[Tensor, "B E"]], Weights],
     std: float,
     means: RunningMeans,
     max_offset: Float64[Tensor, "B N"],
 ) -> tuple[GraphInputs, RunningMeans]:
-    """The network's inputs for a step and its solution with those weights (1/m²) and shifts (m) of
-    its links, and the running means after it."""
+    """The network's inputs for a step and its solution, with ``weights`` (1/m²) and shifts (m) of
+    links by their residuals (m), and the running means after it."""
     pairs, d = inputs.links.pairs, solution.position.shape[-1]
     there = pairs.there.double()
     unit, length = pairs.units(solution.position)
-    residual = (inputs.listed.links.distance - length) * there
+    residual = inputs.listed.links.distance - length
+    weight, shift = weights(residual)
+    residual = residual * there
     innovation = torch.where(inputs.fixed.unsqueeze(-1), 0.0, inputs.prior - solution.position)
     means, mean, seen = _updated(means, pairs, residual, innovation)
     variance = pairs.other(_own_variance(inputs, pairs, weight, d))

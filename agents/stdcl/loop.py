@@ -1,6 +1,7 @@
 """The closed loop of a swarm filter and the ST-GNN (ST-DCL paper, section 4.2.3)."""
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float64
@@ -107,11 +108,9 @@ class NetworkLoop(Localizer[LoopBelief]):
             if self.feedback.links:
                 inputs = replace(inputs, confidence=belief.confidence)
             solution = self.base.solve(belief.base, inputs)
-            weight, shift = self.base.weights(solution.position, inputs.listed)
             limit = self._max_offset(inputs, solution)
-            graph, means = graph_inputs(
-                inputs, solution, weight, shift, self.std, belief.means, limit
-            )
+            weights = partial(self.base.weights_at, inputs=inputs.listed)
+            graph, means = graph_inputs(inputs, solution, weights, self.std, belief.means, limit)
         correction, convolutions = self.network(graph, belief.convolutions, self.feedback.judged)
         if torch.is_grad_enabled():
             carrier = _gradient_carrier(belief, graph)

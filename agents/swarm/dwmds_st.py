@@ -107,7 +107,7 @@ class DynamicMds(SwarmFilter):
                     torch.where(active[..., 0], new, old)
                     for new, old in zip(found, (weight, shift), strict=True)
                 )
-                v = self._laplacian(weight, inputs, free) + majorant
+                v = pairs.laplacian(weight, free) + majorant
                 v = joint.pin(v, inputs.fixed[:, free])
                 factor = torch.linalg.cholesky_ex(v).L  # V, the Laplacian of W plus Λ
             strength = weight * (distance - shift - length)
@@ -152,11 +152,6 @@ class DynamicMds(SwarmFilter):
         strength = adaptive.smoothing(inputs.links.mask, self.std).clamp_min(_NO_PRIOR)
         return torch.diag_embed(strength.unsqueeze(-1) * each)
 
-    def _laplacian(
-        self, weight: Float64[Tensor, "B E"], inputs: StepInput, free: Int64[Tensor, "M"]
-    ) -> Float64[Tensor, "B L L"]:
-        return joint.laplacian(inputs.links.pairs.matrix(weight.unsqueeze(1)), free)
-
     def _posterior(
         self,
         each: Float64[Tensor, "B E"],
@@ -166,7 +161,7 @@ class DynamicMds(SwarmFilter):
     ) -> Float64[Tensor, "B N e K"]:
         """The joint covariance by what ``each`` of the step's links informs, and all other
         ``information`` (1/m²)."""
-        total = self._laplacian(each / self.process.dim, inputs, free) + information
+        total = inputs.links.pairs.laplacian(each / self.process.dim, free) + information
         part = joint.posterior(total, inputs.fixed[:, free], inputs.variance[:, free])
         return joint.embed(part, free, inputs.variance)
 

@@ -113,7 +113,7 @@ def laplacian(
 ) -> Float64[Tensor, "B M M"]:
     """The rows and columns in ``index`` of Σ_{i<j} W_ij (e_i − e_j)(e_i − e_j)ᵀ."""
     matrix = -weight[:, index.unsqueeze(-1), index]
-    matrix.diagonal(dim1=-2, dim2=-1).add_(weight[:, index].sum(-1))
+    matrix.diagonal(dim1=-2, dim2=-1).add_(weight.sum(-1)[:, index])
     return matrix
 
 

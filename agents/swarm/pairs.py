@@ -37,8 +37,8 @@ class Pairs:
 
     def apart(self, x: Float[Tensor, "B N d"]) -> Float[Tensor, "B d E"]:
         """x_i − x_j of what UAVs have."""
-        i, j = self.own(x.mT).unbind(-2)
-        return i - j
+        i, j = self.ends.unbind(1)
+        return torch.stack([of.gather(1, i) - of.gather(1, j) for of in x.unbind(-1)], 1)
 
     def units(self, y: Float[Tensor, "B N d"]) -> tuple[Float[Tensor, "B d E"], Tensor]:
         """The unit vectors u_ij from j to i, and the lengths [B, E] of links (1e-9 at least)."""
@@ -49,16 +49,14 @@ class Pairs:
     def sums(self, x: Tensor) -> Tensor:
         """Σ_j x_ij at every UAV, [B, *s, N], of what links have at both ends, [B, *s, 2, E], or
         have alike, [B, *s, 1, E]."""
-        i, j = both(x).unbind(-2)
-        return self._added(i, j)
+        at_i, at_j = both(x).unbind(-2)
+        return self._at(0, at_i) + self._at(1, at_j)
 
     def along(self, strength: Tensor, unit: Float[Tensor, "B d E"]) -> Float[Tensor, "B N d"]:
         """Σ_j s_ij u_ij at every UAV, of strengths at both ends, [B, 2, E], or alike, [B, 1, E]."""
-        if strength.shape[1] == 1:
-            at_i = strength * unit
-            return self._added(at_i, -at_i).mT
-        at_i, at_j = (one.unsqueeze(1) * unit for one in strength.unbind(1))
-        return self._added(at_i, -at_j).mT
+        at_i = strength[:, :1] * unit
+        at_j = at_i if strength.shape[1] == 1 else strength[:, 1:] * unit
+        return (self._at(0, at_i) - self._at(1, at_j)).mT
 
     def largest(self, x: Float[Tensor, "B 2 E"]) -> Float[Tensor, "B N"]:
         """max_j x_ij at every UAV; −∞ without a link."""
@@ -83,6 +81,18 @@ class Pairs:
         matrix.scatter_(1, self._places.flatten(1), both(x).flatten(1))
         return matrix.unflatten(1, (self.n, -1))
 
+    def laplacian(
+        self, weight: Float[Tensor, "B E"], index: Int64[Tensor, "M"]
+    ) -> Float[Tensor, "B M M"]:
+        """The rows and columns of the UAVs in ``index`` of Σ W_ij (e_i − e_j)(e_i − e_j)ᵀ."""
+        m, weight = len(index), weight.unsqueeze(1)
+        place = torch.full((self.n,), m, device=index.device)  # all others are one more
+        place[index] = torch.arange(m, device=index.device)
+        among = Pairs(place[self.ends], self.there, m + 1)
+        matrix = among.matrix(-weight)[:, :m, :m]
+        matrix.diagonal(dim1=-2, dim2=-1).add_(self.sums(weight)[:, index])
+        return matrix
+
     def components(self) -> Int64[Tensor, "B N"]:
         """The first UAV of the connected component of the network that each belongs to."""
         label = torch.arange(self.n, device=self.ends.device).expand(len(self.ends), -1)
@@ -94,11 +104,10 @@ class Pairs:
                 return label
             label = lower
 
-    def _added(self, at_i: Tensor, at_j: Tensor) -> Tensor:
-        total = at_i.new_zeros(*at_i.shape[:-1], self.n)
-        for end, one in zip(self.ends.unbind(1), (at_i, at_j), strict=True):
-            total = total.scatter_add(-1, _over(end, one), one)
-        return total
+    def _at(self, end: int, x: Tensor) -> Tensor:
+        """Sums at every UAV, [B, *s, N], of what links have at one end, [B, *s, E]."""
+        total = x.new_zeros(*x.shape[:-1], self.n)
+        return total.scatter_add(-1, _over(self.ends[:, end], x), x)
 
     @cached_property
     def _places(self) -> Int64[Tensor, "B 2 E"]:

@@ -64,6 +64,20 @@ def test_the_network_is_that_of_the_paper() -> None:
     }
 
 
+@pytest.mark.parametrize("m", [110, 350, 799])
+def test_a_particle_is_corrected_alike_however_many_there_are(m: int) -> None:
+    corrector, features = WeightCorrector(), normal(6, 7, 4, 800, seed=3).movedim(0, -1)
+    with torch.no_grad():
+        every = corrector(features)
+        assert torch.equal(corrector(features[2:3, 1:2, :m]), every[2:3, 1:2, :m])
+
+
+def test_gradients_of_what_is_far_away_are_finite() -> None:
+    corrector = WeightCorrector()
+    corrector(1e4 * normal(30, 6)).sum().backward()
+    assert all(bool(p.grad.isfinite().all()) for p in corrector.parameters())
+
+
 def test_features_of_the_plane_have_no_height() -> None:
     particles, last = normal(2, 3, 7, 5), normal(2, 3, 4, seed=1)
     found = motion_features(particles, last, 2)

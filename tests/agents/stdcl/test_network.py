@@ -80,7 +80,8 @@ def graph_of(step: Any, means: RunningMeans | None = None, std: float = STD) -> 
     inputs, found, weight, shift = step
     of = inputs.links.pairs.of
     means = no_means(inputs.fixed.shape[1]) if means is None else means
-    return graph_inputs(inputs, found, of(weight), of(shift), std, means, max_offset(found))
+    given = of(weight), of(shift)
+    return graph_inputs(inputs, found, lambda _: given, std, means, max_offset(found))
 
 
 def corrections(network: StGnn, *steps: Any) -> list[Any]:

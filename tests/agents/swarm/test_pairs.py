@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, laplacian
 from torch import Tensor
 
 from agents.swarm.links import along_links, connected, lengths
@@ -50,6 +50,19 @@ def test_forces_along_links(seed: int, n: int, share: float) -> None:
     directed = torch.stack((pairs.of(strength), pairs.of(strength.mT)), 1)
     expected = along_links(y, strength, lengths(y))
     assert torch.allclose(pairs.along(directed * pairs.there.unsqueeze(1), unit), expected)
+
+
+@given(st.integers(0, 1000), st.integers(2, 20), st.floats(0.0, 1.0))
+@settings(max_examples=20, deadline=None)
+def test_laplacians_are_scipys(seed: int, n: int, share: float) -> None:
+    mask, pairs, generator = network(seed, n, share)
+    weight = torch.rand(3, n, n, generator=generator, dtype=torch.float64)
+    weight = (weight + weight.mT) * mask
+    index = torch.randperm(n, generator=generator)[: 1 + n // 2]
+    found = pairs.laplacian(pairs.of(weight), index)
+    for one, whole in zip(found, weight, strict=True):
+        rows = torch.tensor(laplacian(whole.numpy()))[index][:, index]
+        assert torch.allclose(one, rows, rtol=1e-12)
 
 
 @given(st.integers(0, 1000), st.integers(1, 30), st.floats(0.0, 0.3))

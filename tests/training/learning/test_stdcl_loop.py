@@ -135,10 +135,10 @@ def test_what_is_fed_back_is_followed_to_the_next_step(recorded: SimpleNamespace
             inputs = loop.base.predict(belief.base, observation)
             weighted = loops.replace(inputs, confidence=confidence)
             solution = loop.base.solve(belief.base, weighted)
-            weight, off = loop.base.weights(solution.position, inputs.listed)
+            weights = partial(loop.base.weights_at, inputs=inputs.listed)
             limit = loop._max_offset(inputs, solution)
             graph, _ = loops.graph_inputs(
-                inputs, solution, weight, off, loop.base.std, belief.means, limit
+                inputs, solution, weights, loop.base.std, belief.means, limit
             )
             carrier = loops._gradient_carrier(belief, graph)
         return solution.position.detach() + carrier, state

@@ -158,14 +158,14 @@ class _Weights:
 
     def __init__(self, localizer: Any) -> None:
         base: SwarmFilter = getattr(localizer, "base", localizer)
-        weights, variance = base.weights, base.std**2
+        weights, variance = base.weights_at, base.std**2
         self.last: Floats = np.zeros((0, 0))
 
-        def recorded(y: Float64[Tensor, "B N d"], inputs: StepInput) -> Weights:
-            weight, shift = weights(y, inputs)
+        def recorded(residual: Float64[Tensor, "B *L"], inputs: StepInput) -> Weights:
+            weight, shift = weights(residual, inputs)
             pairs = inputs.links.listed
             whole = weight if pairs is None else pairs.matrix(weight.unsqueeze(1))
             self.last = variance * whole[0].numpy()
             return weight, shift
 
-        base.weights = recorded  # type: ignore[method-assign]
+        base.weights_at = recorded  # type: ignore[method-assign]
