@@ -61,14 +61,10 @@ def concat(parts: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n"]:
 
 
 def product(a: Float[Tensor, "*s 4"], b: Float[Tensor, "*s 4"]) -> Float[Tensor, "*s 4"]:
-    """Hamilton product ``a ⊗ b``; where one ``a`` turns a whole cloud, b ↦ a ⊗ b is a matrix."""
-    if b.dim() > _STATES and a.shape[-2] > 1:
-        return geometry.quaternion_product(a, b)
-    pairs = _product_map(a.dtype, a.device)
+    """Hamilton product ``a ⊗ b``."""
     if b.dim() > _STATES:
-        by = (a[..., 0, :] @ pairs.view(4, 16)).unflatten(-1, (4, 4))
-        return (by.mT @ b.mT).mT
-    return _bilinear(pairs, a, b)
+        return geometry.quaternion_product(a, b)
+    return _bilinear(_product_map(a.dtype, a.device), a, b)
 
 
 def matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
@@ -77,31 +73,6 @@ def matrix(attitude: Float[Tensor, "*s a"]) -> Float[Tensor, "*s d d"]:
         return geometry.rotation_matrix(attitude)
     flat = _bilinear(_matrix_map(attitude.dtype, attitude.device), attitude, attitude)
     return flat.unflatten(-1, (3, 3))
-
-
-@lru_cache
-def turn_map(dim: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "t d*d"]:
-    """``turn`` → R̄ᵀ R − I, row by row: 2 w [v]× + 2 [v]×² (Rodrigues, of half the angle)."""
-    eye = torch.eye(dim, dtype=dtype, device=device)
-    plane = eye.new_tensor([[[0.0, -1.0], [1.0, 0.0]]])
-    generators = geometry.cross_matrix(eye) if dim == 3 else plane
-    one_or_generator = torch.cat((eye.unsqueeze(0), generators))
-    return 2 * (one_or_generator.unsqueeze(1) @ generators).flatten(0, 1).flatten(1)
-
-
-def turn(
-    attitude: Float[Tensor, "*s m a"], about: Float[Tensor, "*s a"]
-) -> Float[Tensor, "*s t m"]:
-    """What the rotations R of a cloud differ by from that of ``about``, R̄: the products (w, v) ⊗ v
-    of the half-angle quaternions of R̄ᵀ R (in the plane v is a number). All are small where
-    rotations are close, so nothing cancels in what is made of them by ``turn_map``."""
-    about = about.unsqueeze(-2)
-    if attitude.shape[-1] == 4:
-        r = product(geometry.quaternion_conjugate(about), attitude).mT
-    else:
-        half = 0.5 * (attitude - about).mT
-        r = torch.cat((half.cos(), half.sin()), -2)
-    return (r.unsqueeze(-2) * r[..., None, 1:, :]).flatten(-3, -2)
 
 
 def exp(v: Float[Tensor, "*s 3"]) -> Float[Tensor, "*s 4"]:

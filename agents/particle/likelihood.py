@@ -46,23 +46,26 @@ def landmark_log_likelihood(
     weight = there.to(seen.dtype)
     if trust.weight is not None:
         weight = weight * trust.weight.to(weight.dtype)
-    weight = weight.unsqueeze(-1) * (-0.5 / model.std**2)
+    weight = weight.unsqueeze(-1)
     z = seen * weight
     points = observation["landmark_map"].unflatten(-1, (-1, d)) - centre[..., None, :d]
     at = process.rotation(centre)
     if at is None:
         raise ValueError("landmark vectors are in the body frame: the motion model has no attitude")
-    sum_z = z.sum(-2)
-    # ΔR = R̄ D enters through 2 R̄ D Σwz and −2 tr(D Σwz Lᵀ R̄): one product with D's parts.
-    by_row = at.unsqueeze(-1) * (2 * sum_z[..., None, None, :])
-    trace = -2 * at.mT @ points.mT @ z
-    by = torch.cat((by_row, trace.unsqueeze(-3)), -3).flatten(-2)
-    turn = rotations.turn(process.attitude(particles), process.attitude(centre))
-    turned = by @ rotations.turn_map(d, turn.dtype, turn.device).mT @ turn
-    fixed = 2 * ((at @ sum_z.unsqueeze(-1)) - (points * weight).sum(-2).unsqueeze(-1))
-    p = (particles[..., :d] - centre[..., None, :d]).mT
-    along = p * (weight.sum(-2, keepdim=True) * p + (turned[..., :d, :] + fixed))
-    return sum(along.unbind(-2)) + turned[..., d, :]
+    count, sum_z = weight.sum((-2, -1)), z.sum(-2)
+    p = particles[..., :d] - centre[..., None, :d]
+    rotation = process.rotation(particles)
+    assert rotation is not None
+    turn = rotation.flatten(-2) - at.flatten(-2).unsqueeze(-2)
+    # ΔR enters through ΔR Σz and tr(ΔR Σ z Lᵀ): one product with a [d², d + 1] matrix.
+    by_row = torch.zeros(*sum_z.shape[:-1], d, d, d + 1, dtype=torch.float32, device=z.device)
+    for row in range(d):
+        by_row[..., row, :, row] = sum_z
+    by_row[..., d] = points.mT @ z
+    turned = (by_row.flatten(-3, -2).mT @ turn.mT).mT
+    fixed = (points * weight).sum(-2) - (at @ sum_z.unsqueeze(-1))[..., 0]
+    along = p * (count[..., None, None] * p + 2 * (turned[..., :d] - fixed.unsqueeze(-2)))
+    return (sum(along.unbind(-1)) - 2 * turned[..., d]) * (-0.5 / model.std**2)
 
 
 def range_log_likelihood(
