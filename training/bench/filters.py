@@ -55,17 +55,22 @@ def observed(scenario: Scenario, steps: int) -> list[Observation]:
     return seen
 
 
-def ours(agent: str, scenario: Scenario, seen: Sequence[Observation]) -> Run:
-    """An agent of ours, again and again from the same belief."""
+def beliefs(scenario: Scenario, seen: Sequence[Observation]) -> list[Any]:
+    """``apf``'s before each step after the warm-up."""
+    localizer = make(f"apf:{COUNT}", scenario)
+    found = [localizer.reset(seen[0])]
+    for observation in seen[:-1]:
+        found.append(localizer.step(found[-1], observation)[0])
+    return found[WARM_UP:]
+
+
+def ours(agent: str, scenario: Scenario, seen: Sequence[Observation], before: Sequence[Any]) -> Run:
+    """An agent's steps, each from a belief of ``before``: all redraw the same UAVs."""
     localizer = make(agent, scenario)
-    start = localizer.reset(seen[0])
-    for observation in seen[:WARM_UP]:
-        start, _ = localizer.step(start, observation)
 
     def run() -> np.ndarray:
-        belief = start
-        for observation in seen[WARM_UP:]:
-            belief, estimate = localizer.step(belief, observation)
+        for belief, observation in zip(before, seen[WARM_UP:], strict=True):
+            _, estimate = localizer.step(belief, observation)
         return estimate.position[0].numpy()
 
     return run
@@ -185,11 +190,11 @@ def main() -> None:
     torch.set_grad_enabled(False)
     scenario = room()
     seen = observed(scenario, WARM_UP + STEPS)
-    runs = {PEER: peer(scenario, seen)}
+    before, runs = beliefs(scenario, seen), {PEER: peer(scenario, seen)}
     compiler = shutil.which("c++") or shutil.which("g++")
     for more in ("", ":compile=true") if compiler else ("",):
         for name in OURS:
-            runs[f"`{name}{more}`"] = ours(f"{name}:{COUNT}{more}", scenario, seen)
+            runs[f"`{name}{more}`"] = ours(f"{name}:{COUNT}{more}", scenario, seen, before)
     found = table(cpu_ms(runs, ROUNDS), f"python -m training.bench.filters --out {out}")
     out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
