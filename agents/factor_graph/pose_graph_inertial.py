@@ -25,7 +25,7 @@ from coloc_env.observation import Observation
 from coloc_env.scenario import Believed, Inertial
 from coloc_env.sensors import Imu, RelativePose, Sensor
 
-_EXACT = 1e-4  # m, rad, m/s: of what is fixed
+_EXACT = 1e-3  # m, rad, m/s: of what is fixed
 _LEAST = 1e-4  # m/s², rad/s: standard deviation of a bias that is believed to be zero
 _WINDOW = 50  # steps
 _REWEIGHTED = 10  # times, for an initial estimate
@@ -49,7 +49,7 @@ class InertialPoseGraph(PoseGraph):
         self.params = gtsam.PreintegrationParams(np.zeros(3))  # no gravity in a frame that falls
         self.params.setAccelerometerCovariance(np.eye(3) * accel**2 * dt)
         self.params.setGyroscopeCovariance(np.eye(3) * gyro**2 * dt)
-        self.params.setIntegrationCovariance(np.eye(3) * 1e-8)
+        self.params.setIntegrationCovariance(np.eye(3) * 1e-6)
         biases = [max(motion.accel_bias, _LEAST)] * 3 + [max(motion.gyro_bias, _LEAST)] * 3
         self.bias = gtsam.noiseModel.Diagonal.Sigmas(np.array(biases))
         self.velocity_std = math.sqrt(2) * believed.prior.velocity_spread

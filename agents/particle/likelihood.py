@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from agents.models import rotations
 from agents.models.measurements import (
     AnchorRanges,
     Block,

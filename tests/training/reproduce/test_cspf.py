@@ -147,7 +147,7 @@ def test_claims_about_recordings_follow_the_runs(settings: Settings) -> None:
         runs.record.error[:] *= rng.uniform(0.9, 1.1, (RUNS, 1, 1))
         return runs
 
-    better = ("stein_vi", plan.FAST, "cspf")
+    better = ("stein_vi", plan.FAST, plan.QUICK)
     worse = (WORLD, *plan.ALONE[1:], *plan.TEAM[1:], *plan.INERTIAL[1:])
     for good, verdict in ((True, REPRODUCED), (False, CONTRADICTED)):
         near, far = (0.1, 0.5) if good else (0.5, 0.1)

@@ -49,7 +49,7 @@ def errors(results: Results) -> Figure | None:
     lines[0].set_label("particles")
     axes.plot(time, smoother.error[0, :, 0], color=_ORANGE, linewidth=1.8, label="smoother")
     axes.plot(time, stein.error[0, :, 0], color=_DARK, linewidth=0.9, label="stein_vi")
-    axes.set(xlabel="time (s)", ylabel="position error (m)", yscale="log")
+    axes.set(xlabel="time (s)", ylabel="position error (m)", ylim=(0, 0.2))
     axes.legend(fontsize=8, loc="upper right")
     return figure
 
