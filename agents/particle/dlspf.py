@@ -65,7 +65,8 @@ class LatentParticleFilter(Localizer[LatentBelief]):
     A particle is weighed by the likelihood of the state that it decodes to. What is no part of a
     window (attitude, IMU biases) is carried beside the latent state, and moves as in ``pf500``, as
     do tempering and Liu–West moves after resampling; nothing is redrawn from an EKF. A motion model
-    in space that estimates velocity is needed. ``weights``: a checkpoint's name or path.
+    in space that estimates velocity is needed. ``weights``: a checkpoint's name or path,
+    or none.
     """
 
     name = "dlspf"

@@ -65,6 +65,8 @@ class SwarmFilter(Localizer[SwarmBelief]):
         sensor = believed.sensor(Ranging)
         if sensor is None or sensor.tags:
             raise NotServed("a team with ranges between UAVs, without lever arms, is needed")
+        if sensor.noise.std == 0:
+            raise NotServed("ranges believed to have no noise weigh too much: uwb_std=0")
         self.std, self.process = sensor.noise.std, make_process(believed)
         self.range_models = [UavRanges(sensor)]
         self.confidence = CONFIDENCES[confidence](self.std)

@@ -15,12 +15,14 @@ from scipy.sparse.csgraph import floyd_warshall
 from scipy.stats import norm
 from torch import Tensor
 
+from agents import make
 from agents.swarm import calibration, ins_bias, joint, persistence, weights
 from agents.swarm.gauss_newton import fisher, gauss_newton
 from agents.swarm.links import lengths, links_of
 from agents.swarm.majorization import descent, guttman_step, majorizer, stress
 from agents.swarm.scaling import classical_scaling, procrustes, shortest_paths
 from coloc_env.observation import Observation
+from coloc_env.scenarios import make_scenario
 from coloc_env.sensors import Ins
 
 STD = 10.0
@@ -445,3 +447,10 @@ def test_fisher_information_is_that_of_automatic_differentiation() -> None:
     jacobian = torch.func.jacrev(measured)(world["place"].flatten())
     found = fisher(world["place"], world["weight"])[0].flatten(2).flatten(0, 1)
     assert torch.allclose(found, jacobian.mT @ jacobian, atol=1e-12)
+
+
+@pytest.mark.parametrize("agent", ["map", "stdcl", "dwmds_st", "vmds"])
+def test_ranges_without_noise_are_refused(agent: str) -> None:
+    with pytest.raises(ValueError, match="no noise weigh too much: uwb_std=0"):
+        make(agent, make_scenario("swarm-v0", n_uavs=5, uwb_std=0.0))
+    make(agent, make_scenario("swarm-v0", n_uavs=5, uwb_std=0.0, believed_uwb_std=0.1))
