@@ -113,7 +113,7 @@ def test_rllib_learns() -> None:
 @pytest.mark.slow
 def test_skrl_learns() -> None:
     found = example("skrl_ippo", "skrl").main(steps=4_000, horizon=50, episodes=1)
-    assert found["after"] < 0.8 * found["before"]
+    assert found["after"] < 0.95 * found["before"]
 
 
 @pytest.mark.slow
